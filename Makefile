@@ -15,7 +15,7 @@ TYPED := $(patsubst %,tests/test_%.py,types files numbers fields inspection kalm
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet -c constraints.txt torch
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e ".[dev]"
-	$(BIN)/ep2sindy warm
+	$(BIN)/ep2sindy precompile
 	touch $@
 
 breathing: .venv/installed

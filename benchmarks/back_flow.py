@@ -2,7 +2,7 @@
 
 On `thruster=lif`, whose ions flow back to the anode over much of the channel: structures of two
 densities, each refined as it is on three quarters of the record of every operating point, and run
-freely over the rest. `python -m benchmarks.living lif_law_back` has the one that lives on all
+freely over the rest. `python -m benchmarks.sustained lif_law_back` has the one that lives on all
 splits, `lif_zones` and `lif_several` other zones, `python -m benchmarks.linear_criteria lif` the
 orders of each process. Prints a table of docs/living.md.
 """
@@ -13,7 +13,7 @@ import sys
 from dataclasses import replace
 from functools import partial
 
-from benchmarks.living import (
+from benchmarks.sustained import (
     LAW,
     LAW_BACK,
     LAW_TOLD,
@@ -34,7 +34,7 @@ STRUCTURES = {
         name: replace(LAW, exchange=[IONIZED, ("n_i", "n_n", [term])])
         for name, term in RETURNS.items()
     },
-    "told return and neutrals": LAW_TOLD,
+    "stated return and neutrals": LAW_TOLD,
     "and ions out by n_i*n_n": replace(
         LAW_TOLD, outflow={"n_i": ["n_i", "n_i^2", "n_i*n_n"], "n_n": "known"}
     ),
@@ -43,7 +43,7 @@ STRUCTURES = {
         LAW_BACK, outflow={**LAW_BACK.outflow, "n_i": [*LAW_BACK.outflow["n_i"], "n_i*n_n"]}
     ),
     "by n_i*n_n^2, neutrals free": replace(LAW_BACK, outflow={**LAW_BACK.outflow, "n_n": ["n_n"]}),
-    "the same, nothing told": replace(
+    "the same, nothing stated": replace(
         LAW,
         exchange=[IONIZED, ("n_i", "n_n", ["n_i"])],
         outflow={**LAW_BACK.outflow, "n_n": ["n_n"]},

@@ -120,7 +120,7 @@ def counted(making: Making, number: int, noise: float) -> dict[str, float]:
     return found | {FITTED: fitted}
 
 
-def judged(number: int) -> list[dict[str, object]]:
+def assessed(number: int) -> list[dict[str, object]]:
     """Every making at every noise, of one realization."""
     return [
         {"making": name, "noise": noise} | counted(making, number, noise)
@@ -133,7 +133,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="BALASSO on Lorenz, switch by switch")
     parser.add_argument("--n", type=int, default=100, help="realizations")
     n = parser.parse_args().n
-    rows = [row for _, found in Loky().run(judged, range(n)) for row in found]
+    rows = [row for _, found in Loky().run(assessed, range(n)) for row in found]
     grouped = pd.DataFrame(rows).groupby(["making", "noise"], sort=False)
     cells = grouped.sum().astype(int).astype(str)
     cells[FITTED] = grouped[FITTED].median().map("{:.2f}".format)

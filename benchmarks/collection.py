@@ -32,7 +32,7 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.figures.identified import benchmark_figure
 from ep2sindy.library.library import polynomial
 from ep2sindy.model.model import SparseModel, coef_matrix
-from ep2sindy.studies.benchmark import Variant, cells, judged, published_cells
+from ep2sindy.studies.benchmark import Variant, assessed, cells, published_cells
 from ep2sindy.systems.draws import noisy_records
 from ep2sindy.systems.systems import System
 
@@ -106,7 +106,7 @@ def counted(
     """`cells` of all systems together."""
     draw = partial(collected_draw, n_trajectories=n_trajectories, degree=degree)
     tasks = product(names, noises, range(n))
-    rows = [row for task in tasks for row in judged(variants, draw, task, seed=0)]
+    rows = [row for task in tasks for row in assessed(variants, draw, task, seed=0)]
     return cells(pd.DataFrame(rows).assign(system="dysts"))
 
 

@@ -36,7 +36,7 @@ VARIANTS = {
 
 
 def line(name: str, overrides: Sequence[str], speed: float) -> str:
-    """Points whose factors of ionization, divergence and speed come within their shares of 1."""
+    """Points whose factors of ionization, divergence and speed come within their fractions of 1."""
     with tempfile.TemporaryDirectory() as folder:
         program = [sys.executable, "-m", "experiments.run", "+exp=pointwise"]
         given = [
@@ -57,7 +57,10 @@ def line(name: str, overrides: Sequence[str], speed: float) -> str:
     words = []
     for term, values in factors.items():
         off = np.abs(values - 1.0)
-        within = [f"{int((off < share).sum())} within {share:.0%}" for share in (0.03, 0.05, 0.15)]
+        within = [
+            f"{int((off < fraction).sum())} within {fraction:.0%}"
+            for fraction in (0.03, 0.05, 0.15)
+        ]
         words.append(f"{term} {', '.join(within)}")
     scores = found["r2_test"].min("z").values
     return f"{name}: {found.sizes['z']} points; {'; '.join(words)}; R2 {scores.min():.3f} or more"

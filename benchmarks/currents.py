@@ -3,10 +3,11 @@
     python -m benchmarks.currents [grid voltage flow tube] [--noise 0.02]
 
 Records of one signal: the discharge current of the package's thruster, 6 ms at twelve points, with
-white noise in shares of its mean; and the pressure of an oscillator of six terms at eleven powers
-of its heater (tube), with 1.5 % noise. They are written as files, and `+exp=predict` is run over
-them as a user would: it makes a second state, searches its equation over all records, and chooses
-at points left out. A line per set: the equation, and how the models of the others live there.
+white noise in fractions of its mean; and the pressure of an oscillator of six terms at eleven
+powers of its heater (tube), with 1.5 % noise. They are written as files, and `+exp=predict` is run
+over them as a user would: it makes a second state, searches its equation over all records, and
+chooses at points left out. A line per set: the equation, and how the models of the others live
+there.
 """
 
 import argparse
@@ -89,7 +90,7 @@ def measure(name: str, signals: Sequence[Signal], folder: Path) -> str:
     errors = summary["headline"]
     return (
         f"{name}: {chosen['terms']} by {chosen['functions']}; "
-        f"{errors['n_lives']} of {errors['n']} live, frequency "
+        f"{errors['n_sustained']} of {errors['n']} live, frequency "
         f"{errors['f_median']:.2%} in the median, {errors['f_90']:.2%} for nine in ten, "
         f"amplitude {errors['amplitude_median']:.1%}"
     )

@@ -8,8 +8,8 @@ knows the input, and questions: where the column stands beside the signal but no
 where the file lacks it.
 
 `questions`: whether it is asked of other driven signals (a probe's current at a round and another
-frequency; a pendulum that is pushed; ten square waves behind a relaxation), and of self-sustained
-ones, where a question is false, their other states beside them.
+frequency; a pendulum under random perturbations; ten square waves behind a relaxation), and of
+self-sustained ones, where a question is false, their other states beside them.
 
 `discharge`: the supply's voltage is modulated by 5 % at half and at twice the breathing frequency.
 The search is given both records, averaged over the channel, with the voltage as an input and
@@ -30,7 +30,7 @@ import ep2sindy as ep
 from ep2sindy.forecasting.evaluation import evaluate
 from ep2sindy.forecasting.state_estimation import tune_estimator
 from ep2sindy.signals.driving import ask_whether_driven
-from ep2sindy.signals.trace import prepare_signal
+from ep2sindy.signals.signal import prepare_signal
 
 POINT = ep.thruster.OPERATING_POINTS[3]  # 300 V, 5 mg/s
 BREATHING_HZ = 19.15e3
@@ -262,7 +262,7 @@ DRIVEN = {
 ROUND_HZ = 500.0
 PUSHES, LENGTHS = (0.0, 0.05, 0.15), (40, 150)
 
-# Period in s, share of it at the upper level, rise time and relaxation time in periods, noise.
+# Period in s, fraction of it at the upper level, rise time and relaxation time in periods, noise.
 SQUARES = [
     (2e-3, 0.5, 1e-9, 0.1, 0.02),
     (0.02, 0.5, 1e-9, 0.1, 0.1),

@@ -1,7 +1,7 @@
-"""How often the joint estimator finds known equations, in noise of every kind; and its misfits.
+"""How often the joint estimator finds known equations, in noise, and its reports of a lack of fit.
 
     python -m benchmarks.estimation counts [--n 100] [--systems ...] [--noises ...] [--kind white]
-    python -m benchmarks.estimation misfit [--n 25]     # with each true term left out
+    python -m benchmarks.estimation lack of fit [--n 25]     # with each true term left out
     python -m benchmarks.estimation short [--n 10]      # short and sparse records of Lorenz
     python -m benchmarks.estimation degrees [--n 10]    # a library too small; delays at 20 % noise
     python -m benchmarks.estimation samples             # CPU against the number of samples
@@ -10,22 +10,23 @@
     python -m benchmarks.estimation thruster            # the breathing mode, beside free runs
     python -m benchmarks.estimation collection [--n 3] [--noises ...]  # dysts: classes of failure
     python -m benchmarks.estimation courses --n 3 --noises 0.05        # inputs between samples
-    python -m benchmarks.estimation prices [--n 1] [--noises ...]      # dysts: price of a term
+    python -m benchmarks.estimation penalties [--n 1] [--noises ...]      # dysts: penalty of a term
 
-`counts` prints per system and noise: selected exactly right, wrong ones that are called a misfit,
-right ones that are, median CPU-s and the longest; of the right ones the median relative error of a
-coefficient and the share of 95 % intervals that hold the truth.
+`counts` prints per system and noise: selected exactly right, wrong ones that are reported as a lack
+of fit, right ones that are, median CPU-s and the longest; of the right ones the median relative
+error of a coefficient and the fraction of 95 % intervals that hold the truth.
 
-`short` prints for each kind of record: selected right, wrong and called a misfit, wrong and said
-that the samples do not tell, wrong without a word, and the largest RMS miss of the model's own
-steps, in noise, of those that are no misfit: a path that misses them is no trajectory of the model.
+`short` prints for each kind of record: selected right, wrong and reported as a lack of fit, wrong
+and stated that the samples do not tell, wrong without a word, and the largest RMS miss of the
+model's own steps, in noise, of those that are no lack_of_fit: a path that misses them is no
+trajectory of the model.
 
 `collection` prints, for every draw of all systems of dysts, how many are exactly right, CPU-s, the
-intervals, and each wrong one in the first class of these that holds: flagged (called a misfit);
-search (the truth is likelier by more than 4, prices included); near (the truth of every wrong
-equation is among the rivals at better than 1:20); less likely (the truth is, by as much as printed:
-terms that are missed change -2 log likelihood by less than their price). `prices` counts missed and
-false terms against the weight of the choice among terms in a term's price.
+intervals, and each wrong one in the first class of these that holds: flagged (called a
+lack_of_fit); search (the truth is likelier by more than 4, penalties included); near (the truth of
+every wrong equation is among the rivals at better than 1:20); less likely (the truth is, by as much
+as printed: terms that are missed change -2 log likelihood by less than their penalty). `penalties`
+counts missed and false terms against the weight of the choice among terms in a term's penalty.
 """
 
 from __future__ import annotations
@@ -45,44 +46,46 @@ import numpy as np
 import ep2sindy as ep
 from benchmarks.collection import collected_draw, collected_names
 from benchmarks.known_systems import KINDS, OTHERS, noisy
-from benchmarks.living import DOWNSTREAM, POINTS, parts, record
 from benchmarks.many_states import lorenz_96
+from benchmarks.sustained import DOWNSTREAM, POINTS, parts, record
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.estimation import supports
 from ep2sindy.estimation.estimate import Estimate
 from ep2sindy.estimation.problem import scale_problem
 from ep2sindy.estimation.solver import from_smooth
 from ep2sindy.model.inputs import COURSES, curve_through
-from ep2sindy.studies.living import start_of
+from ep2sindy.studies.sustained import start_of
 from ep2sindy.systems.draws import DRAWS
 from ep2sindy.systems.systems import System, lorenz
 from tests.models import model_of
 
 
-def judged(system: System, found: Estimate, cpu_s: float) -> dict[str, float]:
+def assessed(system: System, found: Estimate, cpu_s: float) -> dict[str, float]:
     """Whether the support is right, and of a right one errors and coverage."""
     true, coef = system.model.coef, found.model.coef
     right = bool(((coef != 0.0) == (true != 0.0)).all())
-    row = {"right": float(right), "misfit": float(bool(found.misfit)), "cpu_s": cpu_s}
+    row = {"right": float(right), "lack_of_fit": float(bool(found.lack_of_fit)), "cpu_s": cpu_s}
     if right:
         used = true.T != 0.0
         off = (coef - true).T[used]
         row["error"] = float(np.median(np.abs(off / true.T[used])))
-        if found.model.covariance is not None:  # a misfit has no intervals
+        if found.model.covariance is not None:  # a lack of fit has no intervals
             std = np.sqrt(np.diag(found.model.covariance))
             row["inside"] = float((np.abs(off) <= 1.96 * std).mean())
     return row
 
 
 def counts(systems: Sequence[str], noises: Sequence[float], kind: str, n: int) -> None:
-    print(f"{'system':16} noise  right  misfit(wrong right)  CPU-s median max  error %  inside %")
+    print(
+        f"{'system':16} noise  right  lack of fit(wrong right)  CPU-s median max  error %  inside %"
+    )
     for name, noise in product(systems, noises):
         rows = []
         for number in range(n):
             system, run = noisy(name, noise, number, kind)
             start = time.process_time()
             found = ep.estimate([run], system.model.library)
-            rows.append(judged(system, found, time.process_time() - start))
+            rows.append(assessed(system, found, time.process_time() - start))
         print(f"{name:16} {noise:5g}  {_line(rows)}", flush=True)
 
 
@@ -90,8 +93,8 @@ def _line(rows: Sequence[dict[str, float]]) -> str:
     right = [row for row in rows if row["right"]]
     wrong = [row for row in rows if not row["right"]]
     cpu = [row["cpu_s"] for row in rows]
-    flagged = f"{sum(r['misfit'] for r in wrong):.0f}/{len(wrong)} "
-    flagged += f"{sum(r['misfit'] for r in right):.0f}/{len(right)}"
+    flagged = f"{sum(r['lack_of_fit'] for r in wrong):.0f}/{len(wrong)} "
+    flagged += f"{sum(r['lack_of_fit'] for r in right):.0f}/{len(right)}"
     error = 100.0 * np.median([row["error"] for row in right]) if right else np.nan
     known = [row["inside"] for row in right if "inside" in row]
     inside = 100.0 * np.mean(known) if known else np.nan
@@ -108,9 +111,11 @@ ROUTES = {
 }
 
 
-def misfits(systems: Sequence[str], n: int) -> None:
+def lacks_of_fit(systems: Sequence[str], n: int) -> None:
     """With a true term left out, and with the whole library where that is found."""
-    print(f"called a misfit:  a term left out, by {', '.join(ROUTES)}; right equations, by all")
+    print(
+        f"called a lack_of_fit:  a term left out, by {', '.join(ROUTES)}; right equations, by all"
+    )
     totals = np.zeros((2, len(ROUTES), 2), dtype=int)
     holding = np.zeros((2, 2), dtype=int)  # (equation that is whole, that lacks the term)
     for name in systems:
@@ -124,17 +129,18 @@ def misfits(systems: Sequence[str], n: int) -> None:
             ):
                 for r, method in enumerate(ROUTES.values()):
                     found = ep.discover(run, library.take(kept), method)
-                    if k == 0 and found.estimate is not None and found.misfit:
+                    if k == 0 and found.estimate is not None and found.lack_of_fit:
                         for state, lacks in zip(run.state_names, true[left_out], strict=True):
                             holding[int(lacks)] += state in found.estimate.explained_states, 1
                     if k == 0 or ((found.model.coef != 0.0) == true).all():
-                        counts[k, r] += bool(found.misfit), 1
+                        counts[k, r] += bool(found.lack_of_fit), 1
         totals += counts
-        print(f"{name:16} {_shares(counts)}", flush=True)
-    print(f"{'all':16} {_shares(totals)}")
+        print(f"{name:16} {_fractions(counts)}", flush=True)
+    print(f"{'all':16} {_fractions(totals)}")
     (whole, n_whole), (lacking, n_lacking) = holding.tolist()
     print(
-        f"equations of misfits by joint that are said to hold: {whole} of {n_whole} whole ones, "
+        f"equations by joint of models that do not fit, reported to hold: {whole} of {n_whole} "
+        "whole ones, "
         f"{lacking} of {n_lacking} that lack the term"
     )
 
@@ -153,12 +159,14 @@ def chemical(
     return Trajectory(clean.t, states, clean.state_names)
 
 
-def _shares(counts: np.ndarray) -> str:
+def _fractions(counts: np.ndarray) -> str:
     return "  ".join(f"{called}/{of}" for called, of in counts.reshape(-1, 2))
 
 
 def short(n: int) -> None:
-    print("record                                right misfit open silent   largest miss, CPU-s")
+    print(
+        "record                                right lack of fit open silent   largest miss, CPU-s"
+    )
     for words, make in SHORT.items():
         rows, misses, cpu_s = Counter[str](), [0.0], 0.0
         for number in range(n):
@@ -166,11 +174,17 @@ def short(n: int) -> None:
             found = ep.estimate(runs, LORENZ.model.library)
             cpu_s += time.process_time() - start
             right = bool(((found.model.coef != 0.0) == (LORENZ.model.coef != 0.0)).all())
-            said = "misfit" if found.misfit else "open" if found.too_few_samples else "silent"
-            rows[f"right {said}" if right else said] += 1
-            misses += [] if found.misfit else [_largest_miss(found)]
+            stated = (
+                "lack_of_fit"
+                if found.lack_of_fit
+                else "open"
+                if found.too_few_samples
+                else "silent"
+            )
+            rows[f"right {stated}" if right else stated] += 1
+            misses += [] if found.lack_of_fit else [_largest_miss(found)]
         right = sum(count for word, count in rows.items() if word.startswith("right"))
-        counts = f"{right:5d} {rows['misfit']:6d} {rows['open']:4d} {rows['silent']:6d}"
+        counts = f"{right:5d} {rows['lack_of_fit']:6d} {rows['open']:4d} {rows['silent']:6d}"
         print(f"{words:38}{counts}   {max(misses):.1e}  {cpu_s:.0f}", flush=True)
 
 
@@ -215,9 +229,10 @@ def degrees(n: int) -> None:
         for number in range(n):
             found = ep.estimate([chemical(number, kind)], library, align=align)
             right = degree == 3 and bool(((found.model.coef != 0.0) == true).all())
-            counted += right, bool(found.misfit), bool(found.delays_s.any())
+            counted += right, bool(found.lack_of_fit), bool(found.delays_s.any())
         print(
-            f"degree {degree} {align=} {kind:12} right, misfit, late: {counted} of {n}", flush=True
+            f"degree {degree} {align=} {kind:12} right, lack of fit, late: {counted} of {n}",
+            flush=True,
         )
     total = np.zeros(2, dtype=int)
     for name in [*DRAWS, *OTHERS]:
@@ -237,7 +252,7 @@ def samples() -> None:
         run = longer.trajectory(noise=0.05, rng=0)
         start = time.process_time()
         found = ep.estimate([run], system.model.library)
-        row = judged(system, found, time.process_time() - start)
+        row = assessed(system, found, time.process_time() - start)
         print(f"{n:7d}  {row['cpu_s']:5.2f}  {bool(row['right'])}", flush=True)
 
 
@@ -327,7 +342,7 @@ def judged_draw(name: str, noise: float, number: int) -> Judged:
     found = ep.estimate(runs, system.model.library)
     cpu_s = time.process_time() - start
     true, used = system.model.coef != 0.0, found.model.coef != 0.0
-    row = judged(system, found, cpu_s)
+    row = assessed(system, found, cpu_s)
     failure = "" if row["right"] else _failure(system, runs, found)
     missed, false = int((true & ~used).sum()), int((used & ~true).sum())
     return Judged(name, missed, false, failure, cpu_s, row.get("inside", np.nan))
@@ -335,7 +350,7 @@ def judged_draw(name: str, noise: float, number: int) -> Judged:
 
 def _failure(system: System, runs: Sequence[ep.Trajectory], found: Estimate) -> str:
     """The class of a wrong model, see the module; with what the truth lacks in likelihood."""
-    if found.misfit:
+    if found.lack_of_fit:
         return "flagged"
     behind = _behind(system, runs, found)
     if behind < -4.0:
@@ -351,7 +366,7 @@ def _failure(system: System, runs: Sequence[ep.Trajectory], found: Estimate) -> 
 
 
 def _behind(system: System, runs: Sequence[ep.Trajectory], found: Estimate) -> float:
-    """-2 log likelihood of the true terms minus that of those found, with the terms' prices."""
+    """-2 log likelihood of the true terms minus that of those found, with the terms' penalties."""
     problem = scale_problem(runs, system.model.library)
     scores = []
     for coef in (system.model.coef, found.model.coef):
@@ -377,7 +392,7 @@ def collection(noises: Sequence[float], n: int) -> None:
             )
 
 
-def prices(noises: Sequence[float], n: int) -> None:
+def penalties(noises: Sequence[float], n: int) -> None:
     print("weight  noise  right  missed terms  false terms")
     for noise, weight in product(noises, (0.0, 0.25, 0.5, 1.0, 1.5)):
         supports.GAMMA = weight
@@ -414,7 +429,7 @@ def courses(noise: float, n: int) -> None:
     pendulum = model_of({"th": {"w": 1.0}, "w": swing}, inputs=["u"])
     swings = ep.polynomial(["th", "w", "u"], degree=2, functions=["sin(th)"])
     libraries = {"lag": (lag, ep.polynomial(["x", "u"], degree=3)), "pendulum": (pendulum, swings)}
-    print("right laws, with all 95 % intervals right, all intervals, misfits, courses; CPU-s")
+    print("right laws, with all 95 % intervals right, all intervals, lacks of fit, courses; CPU-s")
     for (name, (model, library)), course, hold in product(libraries.items(), COURSES, (1, 20)):
         rows, chosen = [], []
         for number in range(n):
@@ -429,7 +444,9 @@ def courses(noise: float, n: int) -> None:
                     for term, (low, high) in found.model.intervals(s).items()
                 ]
             rows.append((right, bool(held) and all(held), sum(held), len(held), cpu_s))
-            chosen.append(found.model.courses["u"] + (", a misfit" if found.misfit else ""))
+            chosen.append(
+                found.model.courses["u"] + (", a lack of fit" if found.lack_of_fit else "")
+            )
         laws, within, inside, of, cpu = np.array(rows, dtype=float).T
         print(
             f"{name:9} {course:7} {hold:3} {laws.sum():.0f}/{n} {within.sum():.0f}/{n} "
@@ -440,13 +457,13 @@ def courses(noise: float, n: int) -> None:
 
 WHAT = [
     "counts",
-    "misfit",
+    "lack_of_fit",
     "short",
     "degrees",
     "samples",
     "thruster",
     "collection",
-    "prices",
+    "penalties",
     "waves",
     "chain",
     "courses",
@@ -467,8 +484,8 @@ def main() -> None:
     asked = parser.parse_args()
     if asked.what == "counts":
         counts(asked.systems, asked.noises, asked.kind, asked.n)
-    elif asked.what == "misfit":
-        misfits(asked.systems, asked.n)
+    elif asked.what == "lack_of_fit":
+        lacks_of_fit(asked.systems, asked.n)
     elif asked.what == "degrees":
         degrees(asked.n)
     elif asked.what == "collection":
@@ -477,8 +494,8 @@ def main() -> None:
         waves(asked.sizes or [5, 8, 12, 20], asked.n)
     elif asked.what == "chain":
         chain(asked.sizes or [20], asked.n)
-    elif asked.what == "prices":
-        prices(asked.noises, asked.n)
+    elif asked.what == "penalties":
+        penalties(asked.noises, asked.n)
     elif asked.what == "short":
         short(asked.n)
     elif asked.what == "courses":

@@ -67,12 +67,12 @@ def brusselators() -> None:
     for seed, (a, b), step_s in product(SEEDS, RATES, STEPS_S):
         run, began = brusselator(a, b, step_s, seed), time.process_time()
         first = ep.discover(run)
-        named = re.search(r"degree=(\d)", first.misfit)
-        late += int(" late (" in first.misfit)
-        silent += int(not first.misfit)
+        named = re.search(r"degree=(\d)", first.lack_of_fit)
+        late += int(" late (" in first.lack_of_fit)
+        silent += int(not first.lack_of_fit)
         if named:
             then = ep.discover(run, ep.polynomial(["x", "y"], degree=int(named[1])))
-            right += not then.misfit and [set(then.model.terms(s)) for s in "xy"] == LAW
+            right += not then.lack_of_fit and [set(then.model.terms(s)) for s in "xy"] == LAW
         print(f"a {a} b {b} {step_s} s: {time.process_time() - began:.1f} CPU-s", flush=True)
     n = len(SEEDS) * len(RATES) * len(STEPS_S)
     print(f"of {n}: {late} called late, {silent} without a word, {right} right by the next command")
@@ -92,7 +92,9 @@ def populations() -> None:
             show(state, ep.Trajectory(run.t, run.columns([state]), [state]))
 
 
-def pushed(rates: Callable[[np.ndarray], np.ndarray], n: int, step: float) -> ep.Trajectory:
+def with_process_noise(
+    rates: Callable[[np.ndarray], np.ndarray], n: int, step: float
+) -> ep.Trajectory:
     """Simulated counts: n of two species, pushed by 10 % in a unit of time, counted to 5 %."""
     rng, x, h, states = np.random.default_rng(0), np.array([0.5, 0.3]), step / 100, []
     for k in range(100 * (n + 50)):
@@ -118,8 +120,8 @@ def ahead() -> None:
     tables = {
         "hare and lynx": ep.data.hare_lynx(),
         "Gause": ep.data.gause(),
-        "simulated, Lotka-Volterra": pushed(lotka, 90, 0.5),
-        "simulated, Rosenzweig-MacArthur": pushed(rosenzweig, 90, 0.5),
+        "simulated, Lotka-Volterra": with_process_noise(lotka, 90, 0.5),
+        "simulated, Rosenzweig-MacArthur": with_process_noise(rosenzweig, 90, 0.5),
     }
     for name, run in tables.items():
         n = 2 * run.n_samples // 3
@@ -133,10 +135,11 @@ def ahead() -> None:
             continue
         skill = ep.model.forecast_skill(found.model, run, n_fitted=n, horizon_s=horizon_s)
         own = skill.nrmse["model"]
-        told = own[: skill.n_better] >= rival[: skill.n_better]
+        stated = own[: skill.n_better] >= rival[: skill.n_better]
         print(f"  model: {np.round(own, 2)}; found: {skill.headline}")
         print(
-            f"  a VAR is nearer at {(rival < own).sum()} of {longest} horizons, at {told.sum()} of "
+            f"  a VAR is nearer at {(rival < own).sum()} of {longest} horizons, at "
+            f"{stated.sum()} of "
             f"the {skill.n_better} for which the sentence claims to be better",
             flush=True,
         )
@@ -164,13 +167,13 @@ def long_record() -> None:
     found = ep.discover(run)
     cpu_s, law = time.process_time() - began, "; ".join(found.model.text().splitlines())
     print(f"{run.n_samples} samples: {cpu_s:.1f} CPU-s; {found.remarks[-1]}\n{law}")
-    print(found.misfit or "no misfit")
+    print(found.lack_of_fit or "no lack of fit")
 
 
 def show(name: str, run: ep.Trajectory) -> None:
     found = ep.discover(run)
     law = "; ".join(found.model.text().splitlines())
-    print(f"{name}: {law}\n    {found.misfit[:150] or 'no misfit'}", flush=True)
+    print(f"{name}: {law}\n    {found.lack_of_fit[:150] or 'no lack of fit'}", flush=True)
 
 
 def main() -> None:

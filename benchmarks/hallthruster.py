@@ -255,8 +255,10 @@ def main() -> None:
             line = ", ".join(f"{k} {ours[k]:.2f} ({v})" for k, v in theirs.items())
             line += f"; mass balance {run.attrs['mass_balance']:.4f}"
             if name == "withplume":
-                shares = n_i_over_theirs(run)
-                line += f"; n_i over theirs {', '.join(f'{share:.2f}' for share in shares)}"
+                fractions = n_i_over_theirs(run)
+                line += (
+                    f"; n_i over theirs {', '.join(f'{fraction:.2f}' for fraction in fractions)}"
+                )
             print(f"{name}, {kind}: {line}")
     if not RATE_TABLE.exists():
         print("LANDMARK: name the folder of landmark_rates.csv with EP2SINDY_DATA")

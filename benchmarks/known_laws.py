@@ -4,10 +4,10 @@
     python -m benchmarks.known_laws 5      # seeds per noise level
 
 A Brusselator over one parameter, and a breathing discharge in SI units over voltage and mass flow.
-Their coefficients are linear, quadratic and reciprocal in these, and `ep.discover` is told neither
-terms nor functions. Per system and noise: the seeds whose terms are all right; the root mean square
-error of all coefficients at all points, each point alone and by the law; the errors of rates at
-points left out, as the law says them; CPU time; the functions of the law.
+Their coefficients are linear, quadratic and reciprocal in these, and `ep.discover` is stated
+neither terms nor functions. Per system and noise: the seeds whose terms are all right; the root
+mean square error of all coefficients at all points, each point alone and by the law; the errors of
+rates at points left out, as the law says them; CPU time; the functions of the law.
 """
 
 import sys
@@ -67,10 +67,10 @@ def cycles(system: str) -> list[ep.Trajectory]:
     law, (start, period_s), found = truth(system), STARTS[system], []
     for point in POINTS[system]:
         model, t = law.at(extrapolate=True, **point), np.arange(4000) * period_s / PER_PERIOD
-        warm = model.simulate(t, start).states[2000:]
-        cycle = find_cycle(t[:2000], warm)
+        precompile = model.simulate(t, start).states[2000:]
+        cycle = find_cycle(t[:2000], precompile)
         t = np.arange(N_PERIODS * PER_PERIOD) / (PER_PERIOD * cycle.frequency_Hz)
-        found.append(ep.Trajectory(t, model.simulate(t, warm[0]).states, law.states))
+        found.append(ep.Trajectory(t, model.simulate(t, precompile[0]).states, law.states))
     return found
 
 

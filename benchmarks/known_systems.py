@@ -18,7 +18,7 @@ from ep2sindy.systems.draws import DRAWS, realization
 from ep2sindy.systems.systems import System
 
 # Gaps: percent of the record, and how many gaps they are divided into.
-GAPS = {f"gap{share}x{n}": (share, n) for share in (5, 10, 20, 30) for n in (1, 3)}
+GAPS = {f"gap{fraction}x{n}": (fraction, n) for fraction in (5, 10, 20, 30) for n in (1, 3)}
 KINDS = (
     *("white", "lasting", "heavy", "proportional", "thinned300", "thinned100", "missing"),
     *GAPS,
@@ -165,8 +165,8 @@ def _kept(kind: str, n: int, rng: np.random.Generator) -> np.ndarray:
     if kind == "missing":
         return np.flatnonzero(rng.random(n) > MISSING)
     if kind in GAPS:
-        share, n_gaps = GAPS[kind]
-        length = round(share * n / (100 * n_gaps))
+        fraction, n_gaps = GAPS[kind]
+        length = round(fraction * n / (100 * n_gaps))
         starts = (np.arange(1, n_gaps + 1) * n // (n_gaps + 1)) - length // 2
         return np.setdiff1d(np.arange(n), starts[:, None] + np.arange(length))
     return np.arange(n)

@@ -19,7 +19,7 @@ from ep2sindy.thruster.checks import check_not_negative
 from ep2sindy.thruster.parameters import OperatingPoint, Thruster
 from ep2sindy.thruster.propellants import FloatArray, XenonFits
 from ep2sindy.thruster.transport import AnomalousTransport
-from ep2sindy.thruster.walls import FixedAnode, share
+from ep2sindy.thruster.walls import FixedAnode, fraction
 
 ALPHA_CHANNEL = {1: 1.0, 2: 0.5, 3: 0.4}  # energy-loss coefficient by case; 1 in the plume
 LANDMARK_POINT = OperatingPoint(300.0, 5.0, neutral_speed=150.0)
@@ -114,15 +114,15 @@ class ExponentialWall:
 
     def ion_weight(self, distance: Float[np.ndarray, " z"]) -> Float[np.ndarray, " z"]:
         """1 in the channel and 0 in the plume, but the ion loss itself is zero."""
-        return share(distance, 1.0, 0.0, self.transition)
+        return fraction(distance, 1.0, 0.0, self.transition)
 
     def collision_weight(self, distance: Float[np.ndarray, " z"]) -> Float[np.ndarray, " z"]:
-        """Share of the wall collisions: electrons collide in the channel only."""
-        return share(distance, 1.0, 0.0, self.transition)
+        """Fraction of the wall collisions: electrons collide in the channel only."""
+        return fraction(distance, 1.0, 0.0, self.transition)
 
     def power_weight(self, distance: Float[np.ndarray, " z"]) -> Float[np.ndarray, " z"]:
         """alpha at a distance from the exit in m, negative inside."""
-        return share(distance, self.power_weights[0], self.power_weights[1], self.transition)
+        return fraction(distance, self.power_weights[0], self.power_weights[1], self.transition)
 
 
 def landmark_thruster(case: int, rates: TabulatedRates) -> Thruster:

@@ -21,11 +21,11 @@ from dataclasses import dataclass
 import numpy as np
 
 import ep2sindy as ep
-from benchmarks import living
+from benchmarks import sustained
 from ep2sindy.studies.processes import fitted_rate, recorded_rates
 
-IONS, NEUTRALS = living.STATES
-LIBRARY = ep.polynomial(living.STATES, degree=3)
+IONS, NEUTRALS = sustained.STATES
+LIBRARY = ep.polynomial(sustained.STATES, degree=3)
 STEP = 1e-5  # of a logarithm, for the orders
 # Structures of conf/exp/theories.yaml: terms of ionization, net of what comes back, and of the ions
 # that leave. Predator and prey have neutrals that grow by themselves, as fast as they cross.
@@ -36,7 +36,7 @@ STRUCTURES = {
     "heating": (["n_i*n_n", "n_i^2*n_n"], ["n_i"]),
     "terms of the law": (["n_i^2*n_n", "n_i*n_n^2"], ["n_i", "n_i^2"]),
     "law_back": (
-        ["n_i*n_n", "n_i^2*n_n", "n_i*n_n^2", "n_i"],  # of benchmarks.living
+        ["n_i*n_n", "n_i^2*n_n", "n_i*n_n^2", "n_i"],  # of benchmarks.sustained
         ["n_i", "n_i^2", "n_i*n_n^2"],
     ),
 }
@@ -80,11 +80,11 @@ def orders(terms: Mapping[str, float], at: np.ndarray) -> tuple[float, float]:
     return (logs[0] - logs[1]) / (2.0 * STEP), (logs[2] - logs[3]) / (2.0 * STEP)
 
 
-def law_at_rest(whole: living.Record) -> tuple[complex, Balance]:
+def law_at_rest(whole: sustained.Record) -> tuple[complex, Balance]:
     """The law refined on three quarters: eigenvalue of its rest point, and its balance there."""
-    fitted, judged = living.parts(whole.run, "last")
-    model = living.law(fitted, whole, seed=0).model
-    rest = ep.evaluate(model, judged, initial=living.start_of(judged, model)).rest
+    fitted, assessed = sustained.parts(whole.run, "last")
+    model = sustained.law(fitted, whole, seed=0).model
+    rest = ep.evaluate(model, assessed, initial=sustained.start_of(assessed, model)).rest
     assert rest is not None
     moved, leave = [
         {term: sign * model.terms(IONS)[term] for term in terms}
@@ -100,7 +100,7 @@ def law_at_rest(whole: living.Record) -> tuple[complex, Balance]:
     return complex(rest.growth_per_s, 2.0 * np.pi * rest.frequency_Hz), found
 
 
-def theories(whole: living.Record, crossing: float) -> dict[str, Balance]:
+def theories(whole: sustained.Record, crossing: float) -> dict[str, Balance]:
     """Structures with their rates by the means of the record, and orders by least squares on it.
 
     crossing: speed of the neutrals over the channel's length, in 1/s.
@@ -130,12 +130,14 @@ def theories(whole: living.Record, crossing: float) -> dict[str, Balance]:
     return found
 
 
-def given_back(whole: living.Record) -> str:
-    """What walls and anode give back, in shares of ionization."""
+def given_back(whole: sustained.Record) -> str:
+    """What walls and anode give back, in fractions of ionization."""
     means = {name: float(rate.mean()) for name, rate in whole.balances[""].items()}
     walls, both = means["wall_loss"], means["returned"]
-    shares = [100.0 * rate / means["ionization"] for rate in (walls, both - walls)]
-    return "given back: by the walls {:.0f} %, by the anode {:.0f} % of ionization".format(*shares)
+    fractions = [100.0 * rate / means["ionization"] for rate in (walls, both - walls)]
+    return "given back: by the walls {:.0f} %, by the anode {:.0f} % of ionization".format(
+        *fractions
+    )
 
 
 def row(name: str, found: complex, balance: Balance) -> str:
@@ -146,15 +148,15 @@ def row(name: str, found: complex, balance: Balance) -> str:
 def main() -> None:
     """Print the points of the default source, or those of the sets that are named."""
     for name in sys.argv[1:] or ["default"]:
-        for label in living.oscillating(name):
-            whole = living.record(label, living.CHANNEL, name)
-            print(f"\n{name}, {label}: cycle {living.field(label, name).attrs['f_kHz']:.1f} kHz")
+        for label in sustained.oscillating(name):
+            whole = sustained.record(label, sustained.CHANNEL, name)
+            print(f"\n{name}, {label}: cycle {sustained.field(label, name).attrs['f_kHz']:.1f} kHz")
             print(f"    {given_back(whole)}")
             if name == "default":
                 turning, balance = law_at_rest(whole)
                 print(row("law, Jacobian", turning, balance))
                 print(row("law, closed form", balance.eigenvalue, balance))
-            speed = living.LIF_SPEED if name == "lif" else living.POINTS[label].neutral_speed
+            speed = sustained.LIF_SPEED if name == "lif" else sustained.POINTS[label].neutral_speed
             crossing = float(speed) / ep.thruster.Thruster().channel_length
             for theory, balance in theories(whole, crossing).items():
                 print(row(theory, balance.eigenvalue, balance), flush=True)

@@ -9,9 +9,9 @@ root mean squares over starts, in standard deviations of the held-out samples, b
 and an autoregression by AIC; every start is fitted to the past alone. Records that are not shipped
 lie in the folder of EP2SINDY_DATA. Prints the tables of docs/measured.md.
 
-`sentences` judges what heads the result, over all records and over signals that follow a square
+`sentences` tests what heads the result, over all records and over signals that follow a square
 wave or are noise about a sine: whether the held-out part bears it out, whether a driven signal is
-said to live without a question, and how much the bands hold.
+reported to live without a question, and how much the bands hold.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ DRIFT_A, GAP, N_LONG, PROCESS = 0.4, 0.05, 1_000_000, 0.05
 SHOWN = ("status", "f_error", "amplitude_ratio", "waveform_error")
 N_CYCLES = 2
 POINTS = ((300.0, 5.0), (300.0, 4.0), (300.0, 6.0), (400.0, 5.0))  # V and mg/s
-NOISE = 0.02  # of the simulator's current, as a share of its mean
+NOISE = 0.02  # of the simulator's current, as a fraction of its mean
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,8 +130,8 @@ def is_true(forecast: dict[str, Any]) -> str:
     rivals = [name for name in ("autoregression", "persistence") if name in errors]
     own, rival = (np.array(errors[name]) for name in ("model", rivals[0]))
     until = forecast["better_until_periods"]
-    told = np.array(forecast["horizons_periods"]) <= until * (1.0 + 1e-9)
-    holds = bool(((own < rival) & (own < 1.0))[told].all())
+    stated = np.array(forecast["horizons_periods"]) <= until * (1.0 + 1e-9)
+    holds = bool(((own < rival) & (own < 1.0))[stated].all())
     return "true" if holds and bool(until) == forecast["is_better"] else "not true"
 
 
@@ -139,7 +139,7 @@ def is_true(forecast: dict[str, Any]) -> str:
 class Record:
     """A record of one signal. unit: of its times. driven: whether something else moves it.
 
-    lives: whether it repeats one cycle, so that a model of it may be said to sustain it.
+    lives: whether it repeats one cycle, so that a model of it may be reported to sustain it.
     """
 
     name: str
@@ -147,7 +147,7 @@ class Record:
     x: np.ndarray
     unit: str = "s"
     driven: bool = False
-    lives: bool = True
+    is_sustained: bool = True
 
 
 def sentences() -> None:
@@ -159,14 +159,14 @@ def sentences() -> None:
         if isinstance(found, str):
             print(f"  refused: {found}", flush=True)
             continue
-        told, faults = judge(record, found)
+        stated, faults = assess(record, found)
         n, false = n + 1, false + bool(faults)
         forecast = found.summary.get("forecasts", {}).get("trace")
         if forecast and forecast["coverage_90"] is not None:
             held.append(100 * forecast["coverage_90"])
         bands = told_of_bands(forecast["coverage_90"] if forecast else None)
         slow.append(found.cpu_s)
-        print(f"  {told}\n  {'; '.join(faults) or 'true'}; {bands}; {found.cpu_s:.1f} CPU-s")
+        print(f"  {stated}\n  {'; '.join(faults) or 'true'}; {bands}; {found.cpu_s:.1f} CPU-s")
         print(end="", flush=True)
     outside = sum(not 80 <= each <= 97 for each in held)
     print(
@@ -175,21 +175,21 @@ def sentences() -> None:
     )
 
 
-def judge(record: Record, found: Traced) -> tuple[str, list[str]]:
-    """What is told first of a record, with what follows a question, and what is false in it."""
+def assess(record: Record, found: Traced) -> tuple[str, list[str]]:
+    """What is stated first of a record, with what follows a question, and what is false in it."""
     run = found.summary["evaluations"]["trace"]
     screen = " ".join(found.screen.split())
     forecast = found.summary.get("forecasts", {}).get("trace")
-    asked, lives = "driven?" in screen, run["status"] == "sustained"
-    told = run["status"] if forecast is None else forecast["headline"]
+    asked, is_sustained = "driven?" in screen, run["status"] == "sustained"
+    stated = run["status"] if forecast is None else forecast["headline"]
     faults = [] if forecast is None else false_in(forecast, found.errors)
-    if lives and not record.lives:
-        faults.append("no such record lives")
-    if lives and record.driven and not asked:
+    if is_sustained and not record.is_sustained:
+        faults.append("no such record sustains one cycle")
+    if is_sustained and record.driven and not asked:
         faults.append("driven, and not asked about")
     if "RuntimeWarning" in screen or re.search(r"e\+\d+ (times|standard)", screen):
         faults.append("a warning, or a size that nobody can read")
-    return f"{told}; {run['status']}{', asked whether it is driven' * asked}", faults
+    return f"{stated}; {run['status']}{', asked whether it is driven' * asked}", faults
 
 
 def false_in(forecast: dict[str, Any], errors: pd.DataFrame) -> list[str]:
@@ -208,7 +208,7 @@ def false_in(forecast: dict[str, Any], errors: pd.DataFrame) -> list[str]:
 
 def measured_records() -> Iterator[Record]:
     """Records in the folder of EP2SINDY_DATA, and those that other packages bring."""
-    for name, column, lives in (
+    for name, column, is_sustained in (
         ("laser", "I", True), ("electrochemical", "I", False), ("pendulum", "theta", False),
         ("hallthruster_landmark_3", "I_d", True), ("hallthruster_landmark_2", "I_d", False),
         ("hare_lynx", "hare", True), ("hare_lynx", "lynx", True),
@@ -216,10 +216,10 @@ def measured_records() -> Iterator[Record]:
     ):  # fmt: skip
         unit = "year" if name == "hare_lynx" else "day" if name == "gause" else "s"
         t, x = read(name, column)
-        yield Record(f"{name}, {column}", t, x, unit, lives=lives)
+        yield Record(f"{name}, {column}", t, x, unit, is_sustained=is_sustained)
     spots = statsmodels.api.datasets.sunspots.load_pandas().data
     t, x = spots.to_numpy(float).T
-    yield Record("sunspots", t, x, "year", lives=False)
+    yield Record("sunspots", t, x, "year", is_sustained=False)
     months = statsmodels.api.datasets.elnino.load_pandas().data
     x = months.iloc[:, 1:].to_numpy(float).ravel()
     years = months.iloc[0, 0] + np.arange(len(x)) / 12.0
@@ -227,13 +227,13 @@ def measured_records() -> Iterator[Record]:
     try:
         pywt = importlib.import_module("pywt")
     except ImportError:
-        print("\nECG: not judged; install PyWavelets for it")
+        print("\nECG: not assessed; install PyWavelets for it")
         return
     ecg = pywt.data.ecg().astype(float)
-    yield Record("ECG, 360 Hz", np.arange(len(ecg)) / 360.0, ecg, lives=False)
+    yield Record("ECG, 360 Hz", np.arange(len(ecg)) / 360.0, ecg, is_sustained=False)
 
 
-# What follows a square wave: its period and the lag in s, the share of a period at which it is
+# What follows a square wave: its period and the lag in s, the fraction of a period at which it is
 # high, the time in which it rises in periods, and noise.
 SQUARES = (
     (1.37, 0.1, 0.5, 0.0, 0.01), (1.37, 0.3, 0.5, 0.0, 0.05), (1.37, 1.0, 0.5, 0.0, 0.02),
@@ -256,9 +256,9 @@ def made_records() -> Iterator[Record]:
     t, lasting = 0.05 * np.arange(2000), np.zeros(2000)
     for k in range(1, len(t)):
         lasting[k] = 0.9 * lasting[k - 1] + rng.standard_normal()
-    for share in (0.2, 0.5):
-        x = np.sin(2.0 * np.pi * t / 1.43) + share * lasting / lasting.std()
-        yield Record(f"sine, noise of {share:g} that lasts", t, x, driven=True)
+    for fraction in (0.2, 0.5):
+        x = np.sin(2.0 * np.pi * t / 1.43) + fraction * lasting / lasting.std()
+        yield Record(f"sine, noise of {fraction:g} that lasts", t, x, driven=True)
 
 
 def relaxation(
@@ -289,10 +289,10 @@ def laser() -> None:
     if isinstance(found, Traced):
         off = (found.run["x_model"] - found.run["x_data"]).to_numpy()
         spread = x[:1000].var()
-        shares = ", ".join(
+        fractions = ", ".join(
             f"{n}: {np.mean(off[1 : n + 1] ** 2) / spread:.3f}" for n in (20, 40, 100)
         )
-        print(f"  1000 seen, then free; mean square over the variance after {shares}")
+        print(f"  1000 seen, then free; mean square over the variance after {fractions}")
 
 
 def electrochemical() -> None:
@@ -365,8 +365,8 @@ def current() -> None:
         for seed in range(N_SIMULATED):
             found = trace(*spoil(np.random.default_rng(seed)), "unit=A", f"seed={seed}")
             rows.append(found if isinstance(found, str) else found.summary["evaluations"]["trace"])
-        lives = sum(isinstance(row, dict) and row["status"] == "sustained" for row in rows)
-        print(f"\ncurrent, {words}: {lives} of {len(rows)} live")
+        n_sustained = sum(isinstance(row, dict) and row["status"] == "sustained" for row in rows)
+        print(f"\ncurrent, {words}: {n_sustained} of {len(rows)} live")
         for row in rows:
             shown = row if isinstance(row, str) else [row[key] for key in SHOWN]
             print(f"    {shown}", flush=True)
@@ -418,7 +418,9 @@ def process_noise() -> None:
         for seed in range(N_MOVED):
             found = ep.discover(moved(system, PROCESS, seed), library_of(system))
             own, truth = found.model, system.model
-            if found.misfit or any(set(own.terms(s)) != set(truth.terms(s)) for s in truth.states):
+            if found.lack_of_fit or any(
+                set(own.terms(s)) != set(truth.terms(s)) for s in truth.states
+            ):
                 continue
             right += 1
             for state in truth.states:
@@ -434,8 +436,8 @@ def process_noise() -> None:
         )
 
 
-def moved(system: ep.systems.System, share: float, seed: int) -> ep.Trajectory:
-    """A record at 1 % noise with process noise of a share of every state's RMS in a period."""
+def moved(system: ep.systems.System, fraction: float, seed: int) -> ep.Trajectory:
+    """A record at 1 % noise with process noise of a fraction of every state's RMS in a period."""
     rng, clean, n_substeps = np.random.default_rng(seed), system.trajectory(), 10
     rms = np.sqrt(np.square(clean.states).mean(axis=0))
     turns_Hz = max(crossing_frequency(clean.t, x) for x in clean.states.T)
@@ -445,7 +447,7 @@ def moved(system: ep.systems.System, share: float, seed: int) -> ep.Trajectory:
         for _ in range(n_substeps):
             half = x + 0.5 * h * system.model.derivative(x, none)
             x = x + h * system.model.derivative(half, none)
-            x = x + share * rms * np.sqrt(h * turns_Hz) * rng.standard_normal(len(x))
+            x = x + fraction * rms * np.sqrt(h * turns_Hz) * rng.standard_normal(len(x))
         states.append(x)
     samples = np.array(states) + 0.01 * rms * rng.standard_normal((len(states), len(rms)))
     return ep.Trajectory(clean.t, samples, clean.state_names)
@@ -555,7 +557,7 @@ def neutrals(voltage: float, flow: float) -> None:
     print(
         f"{voltage:g} V, {flow:g} mg/s: {free.status}, frequency off by {100 * free.f_error:.2f} "
         f"%, correlation of the hidden state with n_n {alike:.3f}; "
-        f"{'a misfit' if found.misfit else 'fits'}: {found.model.text()}",
+        f"{'a lack of fit' if found.lack_of_fit else 'fits'}: {found.model.text()}",
         flush=True,
     )
 

@@ -86,8 +86,8 @@ def window_paths(problem: RefinementProblem, scaling: np.ndarray) -> np.ndarray:
             values[:n] = x
             if len(values) > n:
                 k = min(max(int(np.searchsorted(t, now, side="right")) - 1, 0), len(t) - 2)
-                share = (now - t[k]) / (t[k + 1] - t[k])
-                values[n:] = share**CUBIC @ batch.inputs[w, k]
+                fraction = (now - t[k]) / (t[k + 1] - t[k])
+                values[n:] = fraction**CUBIC @ batch.inputs[w, k]
             return terms() @ matrix
 
         with np.errstate(over="ignore", invalid="ignore"):

@@ -26,7 +26,7 @@ N_STARTS = 64
 
 @dataclass(frozen=True)
 class Network:
-    """Equations, a start, the length of the record, and what is told of the roles."""
+    """Equations, a start, the length of the record, and what is stated of the roles."""
 
     equations: Mapping[str, Mapping[str, float]]
     start: tuple[float, ...]
@@ -107,7 +107,7 @@ EPIDEMIC = Network(
 
 
 def record(network: Network, noise: float, seed: int) -> Trajectory:
-    """One run with white noise, a share of each state's RMS."""
+    """One run with white noise, a fraction of each state's RMS."""
     states = list(network.equations)
     t = np.linspace(0.0, network.duration_s, network.n_samples)
     path = model_of(network.equations).simulate(t, np.array(network.start)).states

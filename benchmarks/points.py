@@ -159,9 +159,9 @@ def line(name: str, runs: Sequence[Evaluation]) -> str:
     f[np.isnan(f)] = np.inf
     amplitude = [max(abs(v - 1.0) for v in run.amplitude_ratio.values()) for run in runs]
     waveform = [max(run.waveform_error.values()) for run in runs]
-    lives = sum(run.status is Status.SUSTAINED for run in runs)
+    sustained = sum(run.status is Status.SUSTAINED for run in runs)
     return (
-        f"{name:<22} {lives} of {len(runs)} live; f {np.median(f):.2%}, 9 in 10 "
+        f"{name:<22} {sustained} of {len(runs)} live; f {np.median(f):.2%}, 9 in 10 "
         f"{np.quantile(f, 0.9, method='higher'):.2%}, at most {f.max():.2%}; amplitude "
         f"{np.nanmedian(amplitude):.1%}; waveform {np.nanmedian(waveform):.3f}"
     )

@@ -184,7 +184,7 @@ class PySINDyEnsemble:
 class PySINDyWeakForm:
     """Weak form on random domains of each run, with STLSQ over a range of thresholds.
 
-    half_width: half the length of a domain, as a share of the run.
+    half_width: half the length of a domain, as a fraction of the run.
     """
 
     n_domains: int = 300

@@ -44,7 +44,7 @@ REGIONS: Mapping[str, Equations] = {
     },
 }
 
-# A point where one region's share of the coefficients exceeds this counts as inside the region.
+# A point where one region's fraction of the coefficients exceeds this counts as inside the region.
 INSIDE = 0.95
 
 
@@ -52,23 +52,23 @@ INSIDE = 0.95
 class RegionField:
     """A field and the equations that made it.
 
-    field: n_i, n_n, u_iz, u_ir, R_ion over (time, z, r), in SI. share: (region, z, r), weight of
+    field: n_i, n_n, u_iz, u_ir, R_ion over (time, z, r), in SI. fraction: (region, z, r), weight of
     each region's coefficients at a point; weights sum to 1. library: the terms of the equations.
     """
 
     field: xr.Dataset
-    share: xr.DataArray
+    fraction: xr.DataArray
     library: Library
 
     @property
     def labels(self) -> xr.DataArray:
-        """Number of the region with the greatest share at each point, (z, r)."""
-        return self.share.argmax("region")
+        """Number of the region with the greatest fraction at each point, (z, r)."""
+        return self.fraction.argmax("region")
 
     @property
     def inside(self) -> xr.DataArray:
         """True at points away from the transitions, (z, r)."""
-        return self.share.max("region") > INSIDE
+        return self.fraction.max("region") > INSIDE
 
     def noisy(self, noise: float, *, rng: np.random.Generator | int) -> RegionField:
         """Copy with white noise of `noise` times the RMS of each variable at each point."""
@@ -98,26 +98,27 @@ def three_regions(
 
     regions: equations by region, in the order near the anode, downstream, near the walls. Three
     identical sets make a field of one regime. transition: width of the transition between regions
-    (the scale of a logistic function), as a share of the channel's length and gap.
+    (the scale of a logistic function), as a fraction of the channel's length and gap.
     Integrated by fourth-order Runge-Kutta, one step per sample, inputs exact at half steps.
     Raises ValueError unless there are three regions and two points or more along every axis.
     """
     if len(regions) != 3 or min(n_z, n_r, n_samples) < 2 or not min(dt_s, transition) > 0.0:
         raise ValueError(
             "a field of three regions needs three sets of equations, two points or more along "
-            f"every axis, and dt_s and transition above 0, got {list(regions)}, n_z={n_z}, n_r={n_r}, "
+            f"every axis, and dt_s and transition above 0, got {list(regions)}, n_z={n_z}, "
+            f"n_r={n_r}, "
             f"n_samples={n_samples}, dt_s={dt_s}, transition={transition}"
         )
     channel = thruster or Thruster()
-    # Cell centres, as shares of the channel's length and gap.
+    # Cell centres, as fractions of the channel's length and gap.
     z, r = ((np.arange(n) + 0.5) / n for n in (n_z, n_r))
     z_points, r_points = np.repeat(z, n_r), np.tile(r, n_z)
-    share = _shares(z_points, r_points, transition)
+    fraction = _fractions(z_points, r_points, transition)
     library = named_terms([*STATES, *INPUTS], TERMS)
     coef = np.array([coef_matrix(library, [e[s] for s in STATES]) for e in regions.values()])
     half_t = 0.5 * dt_s * np.arange(2 * n_samples - 1)
     inputs = _inputs(half_t, z_points, r_points)
-    states = _integrate(library, np.einsum("kp,kte->pte", share, coef), inputs, dt_s)
+    states = _integrate(library, np.einsum("kp,kte->pte", fraction, coef), inputs, dt_s)
     values = np.concatenate([states, inputs[::2]], axis=2).reshape(n_samples, n_z, n_r, -1)
     variables = {
         name: (("time", "z", "r"), values[..., k], {"units": UNITS[name]})
@@ -127,15 +128,15 @@ def three_regions(
         "z": ("z", channel.channel_length * z, {"units": "m"}),
         "r": ("r", channel.inner_radius + channel.gap * r, {"units": "m"}),
     }
-    shares = share.reshape(3, n_z, n_r), {"region": list(regions), **places}
+    fractions = fraction.reshape(3, n_z, n_r), {"region": list(regions), **places}
     return RegionField(
         field=xr.Dataset(variables, {"time": ("time", half_t[::2], {"units": "s"}), **places}),
-        share=xr.DataArray(*shares, ("region", "z", "r")),
+        fraction=xr.DataArray(*fractions, ("region", "z", "r")),
         library=library,
     )
 
 
-def _shares(
+def _fractions(
     z: Float[np.ndarray, " points"], r: Float[np.ndarray, " points"], transition: float
 ) -> Float[np.ndarray, "3 points"]:
     """Weights of the anode's, the exit's and the walls' equations; z, r from 0 to 1."""

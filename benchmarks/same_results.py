@@ -146,7 +146,7 @@ def main() -> None:
     parser.add_argument("--only", nargs="*", choices=names, default=names)
     parser.add_argument(
         "--close", type=float, default=0.0, metavar="SHARE",
-        help="let numbers but those of models differ by this share of their size, or of a "
+        help="let numbers but those of models differ by this fraction of their size, or of a "
         "column's standard deviation: what rounding makes of free runs",
     )  # fmt: skip
     arguments = parser.parse_args()
@@ -284,7 +284,7 @@ def contents(folder: Path) -> dict[str, Any]:
 def differing(before: Any, now: Any, place: str, *, close: float = 0.0) -> Iterator[str]:
     """Where what was there is another, or missing; what is new does not count.
 
-    close: share of a number's size, or of a column's standard deviation, that does not count.
+    close: fraction of a number's size, or of a column's standard deviation, that does not count.
     """
     if isinstance(before, dict) and isinstance(now, dict):
         for key, value in before.items():
@@ -301,15 +301,15 @@ def differing(before: Any, now: Any, place: str, *, close: float = 0.0) -> Itera
         yield f"{place}: {str(before)[:80]} became {str(now)[:80]}"
 
 
-def _are_close(before: list[Any], now: list[Any], share: float) -> bool:
-    """Whether all are numbers, and apart by less than a share of their spread, or of their size."""
+def _are_close(before: list[Any], now: list[Any], fraction: float) -> bool:
+    """Whether all are numbers, and apart by less than part of their spread, or of their size."""
     try:
         one, other = (np.array(values, dtype=np.float64) for values in (before, now))
     except (TypeError, ValueError):
         return False
     known = one[np.isfinite(one)]
     spread = known.std() if known.size else 0.0
-    allowed = share * np.maximum(spread, np.maximum(np.abs(one), 1e-3))
+    allowed = fraction * np.maximum(spread, np.maximum(np.abs(one), 1e-3))
     both = np.isnan(one) & np.isnan(other)
     return one.ndim == 1 and bool((both | (np.abs(one - other) <= allowed)).all())
 

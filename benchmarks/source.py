@@ -172,10 +172,12 @@ def print_balances() -> None:
         top = max(float(abs(balance[n]).max()) for n in balance if n != "residual")
         residual = float(abs(balance["residual"]).max()) / top
         out = float((run["mass_flow_i"] + run["mass_flow_n"]).mean())
-        share = out / (1e-6 * POINTS[label].mass_flow_mg_s)
+        fraction = out / (1e-6 * POINTS[label].mass_flow_mg_s)
         mass, energy = run.attrs["mass_balance"], run.attrs["energy_balance"]
         turns = alternation_eV(label)
-        print(f"{label:10s} {residual:.1e}  {share:.5f}  {mass:.7f}  {energy:.7f}  {turns:.1e} eV")
+        print(
+            f"{label:10s} {residual:.1e}  {fraction:.5f}  {mass:.7f}  {energy:.7f}  {turns:.1e} eV"
+        )
 
 
 def print_measured() -> None:

@@ -6,8 +6,9 @@
 
 Differential evolution (Storn & Price 1997) over the numbers of `BOUNDS`. It begins about the set
 `thruster=lif`; every set tried is a row of the file, and the best rows are the next population. A
-set is judged run by run, the telling ones first, and given up once it costs more than the one that
-it would replace; what was not run is left empty. `front` prints the sets that no other one beats.
+set is assessed run by run, the telling ones first, and given up once it costs more than the one
+that it would replace; what was not run is left empty. `front` prints the sets that no other one
+beats.
 """
 
 from __future__ import annotations
@@ -51,7 +52,7 @@ MEASURES = (
     "grid_all", "runs",
 )  # fmt: skip
 COLUMNS = [*BOUNDS, *MEASURES]
-POPULATION, SPREAD = 12, 0.04  # SPREAD: of the first population, as a share of the bounds
+POPULATION, SPREAD = 12, 0.04  # SPREAD: of the first population, as a fraction of the bounds
 N_RUNS, FIRST_LIMIT = 11, 100.0  # of a set; cost of a member of the first population
 DURATION = {"warm_up_s": 1.5e-3, "duration_s": 2e-3}
 FREQUENCY_KHZ = (15.0, 20.0)
@@ -172,7 +173,7 @@ def costs(numbers: Numbers, found: Measures) -> Iterator[float]:
         yield grid_cost(coarse[point], run(numbers, point, n_cells=200), point, found)
 
 
-def judge(numbers: Numbers, limit: float) -> Measures:
+def assess(numbers: Numbers, limit: float) -> Measures:
     """Measures of a set, given up where its cost passes the limit."""
     found: Measures = {"cost": 0.0, "runs": 0.0}
     for cost in costs(numbers, found):
@@ -196,17 +197,17 @@ def append(folder: Path, row: Mapping[str, float]) -> None:
 
 
 def to_unit(numbers: Mapping[str, float]) -> np.ndarray:
-    """Each number as its share of the way between its bounds, in the logarithm for 1/c."""
+    """Each number as its fraction of the way between its bounds, in the logarithm for 1/c."""
     return np.array([
         np.log(numbers[k] / low) / np.log(high / low) if k in LOGARITHMIC
         else (numbers[k] - low) / (high - low) for k, (low, high) in BOUNDS.items()
     ])  # fmt: skip
 
 
-def from_unit(shares: np.ndarray) -> Numbers:
+def from_unit(fractions: np.ndarray) -> Numbers:
     return {
         k: float(low * (high / low) ** x if k in LOGARITHMIC else low + (high - low) * x)
-        for x, (k, (low, high)) in zip(np.clip(shares, 0.0, 1.0), BOUNDS.items(), strict=True)
+        for x, (k, (low, high)) in zip(np.clip(fractions, 0.0, 1.0), BOUNDS.items(), strict=True)
     }
 
 
@@ -229,14 +230,14 @@ def search(folder: Path, n: int, held: Mapping[str, float], limit_s: float) -> N
         rng = np.random.default_rng(len(sets))
         best = complete(sets).nsmallest(POPULATION, "cost")
         if len(best) < POPULATION:
-            shares = first + (SPREAD * rng.normal(size=first.size) if len(sets) else 0.0)
+            fractions = first + (SPREAD * rng.normal(size=first.size) if len(sets) else 0.0)
             limit = FIRST_LIMIT
         else:
             k = int(rng.integers(POPULATION))
-            shares = trial(np.array([to_unit(row) for _, row in best.iterrows()]), k, rng)
+            fractions = trial(np.array([to_unit(row) for _, row in best.iterrows()]), k, rng)
             limit = best["cost"].iloc[k]
-        numbers = from_unit(shares) | dict(held)
-        append(folder, numbers | judge(numbers, limit))
+        numbers = from_unit(fractions) | dict(held)
+        append(folder, numbers | assess(numbers, limit))
         if time.monotonic() - began > limit_s:
             break
     print_front(folder)
@@ -261,9 +262,7 @@ def print_front(folder: Path) -> None:
 def number_by_name(text: str) -> tuple[str, float]:
     name, _, value = text.partition("=")
     if name not in BOUNDS:
-        raise argparse.ArgumentTypeError(
-            f"a number must be one of {', '.join(BOUNDS)}, got {name}"
-        )
+        raise argparse.ArgumentTypeError(f"a number must be one of {', '.join(BOUNDS)}, got {name}")
     return name, float(value)
 
 

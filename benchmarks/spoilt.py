@@ -3,7 +3,7 @@
     python -m benchmarks.spoilt [--systems lorenz ...] [--kinds ...] [--n 5] [--noise 0.02]
 
 Per kind and system: right; wrong without a word; wrong with a remark or "not decided" alone; right
-and called a misfit. With `--words`, what was said of the second, third and fourth.
+and reported as a lack of fit. With `--words`, what was stated of the second, third and fourth.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Spoil = Callable[[System, Trajectory, float, np.random.Generator], np.ndarray]
 
 
 def _white(run: Trajectory, noise: float, rng: np.random.Generator) -> np.ndarray:
-    """Noise of a share of every state's RMS."""
+    """Noise of a fraction of every state's RMS."""
     rms = np.sqrt(np.square(run.states).mean(axis=0))
     return noise * rms * rng.standard_normal(run.states.shape)
 
@@ -68,13 +68,13 @@ def _late(n: int) -> Spoil:
     return spoil
 
 
-def _clipped(share: float) -> Spoil:
-    """The first channel saturates at a share of its largest deviation from the middle."""
+def _clipped(fraction: float) -> Spoil:
+    """The first channel saturates at a fraction of its largest deviation from the middle."""
 
     def spoil(system: System, run: Trajectory, noise: float, rng: np.random.Generator):
         states = run.states + _white(run, noise, rng)
         x = states[:, 0]
-        middle, half = (x.max() + x.min()) / 2.0, share * (x.max() - x.min()) / 2.0
+        middle, half = (x.max() + x.min()) / 2.0, fraction * (x.max() - x.min()) / 2.0
         states[:, 0] = np.clip(x, middle - half, middle + half)
         return states
 
@@ -101,7 +101,7 @@ def _outliers(system: System, run: Trajectory, noise: float, rng: np.random.Gene
 
 
 def _multiplied(system: System, run: Trajectory, noise: float, rng: np.random.Generator):
-    """Noise of a share of the state itself."""
+    """Noise of a fraction of the state itself."""
     return run.states * (1.0 + 2.0 * noise * rng.standard_normal(run.states.shape))
 
 
@@ -151,8 +151,8 @@ def main() -> None:
     parser.add_argument("--kinds", nargs="+", default=list(KINDS), choices=list(KINDS))
     parser.add_argument("--n", type=int, default=5)
     parser.add_argument("--noise", type=float, default=0.02)
-    parser.add_argument("--align", action="store_true", help="bring late channels together")
-    parser.add_argument("--words", action="store_true", help="what was said of doubtful ones")
+    parser.add_argument("--align", action="store_true", help="bring delayed channels together")
+    parser.add_argument("--words", action="store_true", help="what was stated of doubtful ones")
     asked = parser.parse_args()
     method = ep.TrajectorySearch(align=asked.align)
     total: Counter[str] = Counter()
@@ -164,7 +164,7 @@ def main() -> None:
             found = ep.discover(run, system.model.library, method)
             what = _what(system, found)
             counts[what] += 1
-            if asked.words and what not in ("right", "wrong, a misfit"):
+            if asked.words and what not in ("right", "wrong, a lack of fit"):
                 print(f"  {number} {what}: {found.note[:160]} {list(found.remarks)}")
         total += counts
         cpu_s = (time.process_time() - start) / asked.n
@@ -175,14 +175,14 @@ def main() -> None:
 def _what(system: System, found: ep.Discovery) -> str:
     right = bool(((found.model.coef != 0.0) == (system.model.coef != 0.0)).all())
     if right:
-        return "right, a misfit" if found.misfit else "right"
-    if found.misfit:
-        return "wrong, a misfit"
+        return "right, a lack of fit" if found.lack_of_fit else "right"
+    if found.lack_of_fit:
+        return "wrong, a lack of fit"
     doubted = found.remarks or found.note.startswith("not decided")
     return "wrong, a doubt" if doubted else "wrong, silent"
 
 
-WHAT = ("right", "right, a misfit", "wrong, a misfit", "wrong, a doubt", "wrong, silent")
+WHAT = ("right", "right, a lack of fit", "wrong, a lack of fit", "wrong, a doubt", "wrong, silent")
 
 
 def _line(counts: Counter[str]) -> str:

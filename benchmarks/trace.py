@@ -1,4 +1,4 @@
-"""Living models from the discharge current alone: clean, and as a scope has it.
+"""Self-sustained models from the discharge current alone: clean, and as a scope has it.
 
     python -m benchmarks.trace
     python -m benchmarks.trace --seeds 1 --points 300/5
@@ -7,8 +7,8 @@ The simulator's current at four operating points, the method of +exp=trace; thre
 fitted, the rest is run freely from one sample and compared with the current itself, without noise.
 Noise: white, 2 % of the mean current, then 8 bits over the range. A row per point, record and
 seed, of the noise and of the windows that are drawn: frequency error, amplitude and waveform of
-the current, terms of the searched equation (the known one has one more), Floquet multiplier, share
-of starts that reach the cycle, and of the record's samples as starts.
+the current, terms of the searched equation (the known one has one more), Floquet multiplier,
+fraction of starts that reach the cycle, and of the record's samples as starts.
 """
 
 import argparse
@@ -26,7 +26,7 @@ from ep2sindy.model.comparison import Status
 from ep2sindy.regression.bootstraps import Bootstraps
 from ep2sindy.regression.searches import BestSubset
 from ep2sindy.selection.free_run import FreeRunScore
-from ep2sindy.signals.trace import prepare_signal
+from ep2sindy.signals.signal import prepare_signal
 
 POINTS = ("300/4", "300/5", "300/6", "400/5")
 NAME, NOISE, BITS = "I_d", 0.02, 8
@@ -59,7 +59,7 @@ def row(clean: Trajectory, measured: Trajectory, seed: int) -> dict[str, object]
     chosen = ep.embed(signal.window(0, n))
     states = chosen.along(signal.run)  # starts of other runs, and figures
     bounds = ep.model.FreeRunBounds(frequency=0.005, amplitude=0.05)
-    rule = FreeRunScore(bounds=bounds, n_windows=40, judged=(NAME,), n_starts=8, seed=seed)
+    rule = FreeRunScore(bounds=bounds, n_windows=40, assessed=(NAME,), n_starts=8, seed=seed)
     search = BestSubset(max_terms=5, n_best=8)
     method = Regression(search=search, selection=rule, bootstraps=Bootstraps(n=0), depth=8)
     model = discover(chosen.run, chosen.library(degree=3), method).model
@@ -69,10 +69,10 @@ def row(clean: Trajectory, measured: Trajectory, seed: int) -> dict[str, object]
 
     def run_from(k: int) -> ep.model.Evaluation:
         part = held.window(k, held.n_samples)
-        return evaluate(model, part, initial=states.states[n + k], judged=(NAME,))
+        return evaluate(model, part, initial=states.states[n + k], assessed=(NAME,))
 
     run = run_from(0)
-    lives = [run_from(STRIDE * k).status is Status.SUSTAINED for k in range(N_STARTS)]
+    sustained = [run_from(STRIDE * k).status is Status.SUSTAINED for k in range(N_STARTS)]
     cycle = run.cycle
     return {
         "status": run.text,
@@ -81,15 +81,15 @@ def row(clean: Trajectory, measured: Trajectory, seed: int) -> dict[str, object]
         "waveform": run.waveform_error[NAME],
         "terms": len(model.terms("g")),
         "multiplier": np.nan if cycle is None else abs(cycle.multipliers[1]),
-        "reaching": run.share_reaching,
-        "samples": f"{sum(lives)}/{N_STARTS}",
+        "reaching": run.basin_stability,
+        "samples": f"{sum(sustained)}/{N_STARTS}",
         "CPU s": seconds,
         "g'": ", ".join(model.terms("g")),
     }
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="living models from one signal")
+    parser = argparse.ArgumentParser(description="self-sustained models from one signal")
     parser.add_argument("--points", nargs="+", default=POINTS, help="V/mg/s, such as 300/5")
     parser.add_argument("--seeds", type=int, default=3, help="draws of noise and of windows")
     arguments = parser.parse_args()

@@ -34,7 +34,7 @@ RULES: dict[str, Selection] = {
 }
 
 
-def judged(number: int, *, name: str, noise: float, rules: Sequence[str]) -> dict[str, float]:
+def assessed(number: int, *, name: str, noise: float, rules: Sequence[str]) -> dict[str, float]:
     """Was the truth on the fronts, and which rule selected all of it? CPU seconds of each.
 
     A rule selects in vain where the truth is not there, and is not asked.
@@ -71,8 +71,8 @@ def main() -> None:
     given = parser.parse_args()
     n, rules = given.n, given.rules
     for name, noise in product(given.systems, NOISES):
-        judge = partial(judged, name=name, noise=noise, rules=rules)
-        table = pd.DataFrame([row for _, row in Loky().run(judge, range(n))])
+        assess = partial(assessed, name=name, noise=noise, rules=rules)
+        table = pd.DataFrame([row for _, row in Loky().run(assess, range(n))])
         counts = ", ".join(f"{key} {table[key].sum():.0f}" for key in ("on the front", *rules))
         cost = ", ".join(f"{rule} {table[f'{rule}, s'].mean():.2g} s" for rule in rules)
         print(f"{name}, {noise:.0%}: of {n}, {counts}; CPU: {cost}", flush=True)

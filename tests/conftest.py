@@ -1,4 +1,4 @@
-"""What all tests share."""
+"""What all tests fraction."""
 
 import gc
 import os
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
 
-from ep2sindy.app.warm import warm
+from ep2sindy.app.precompile import precompile
 from ep2sindy.report import folder
 from ep2sindy.thruster import cache
 
@@ -21,7 +21,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # of PyTorch, which is imported l
 def pytest_configure(config: pytest.Config) -> None:
     """Before workers start; a run of one process compiles as it goes."""
     if getattr(config.option, "numprocesses", None) and not hasattr(config, "workerinput"):
-        warm()
+        precompile()
 
 
 def pytest_collection_finish() -> None:

@@ -22,8 +22,8 @@ def model_of(
 
 def slopes_of(library: Library, values: np.ndarray) -> np.ndarray:
     """Derivative of every term by every variable, (variables, samples, terms)."""
-    products, shares = library.with_derivatives(len(library.variables))
-    return np.einsum("sp,tvp->vst", products.evaluate(values), shares[:, 1:])
+    products, fractions = library.with_derivatives(len(library.variables))
+    return np.einsum("sp,tvp->vst", products.evaluate(values), fractions[:, 1:])
 
 
 def plain_rows(
@@ -45,12 +45,12 @@ def point_study(
     *,
     terms: Mapping[str, str],
     equations: Sequence[str] = ("n_i", "n_n"),
-    share: np.ndarray | None = None,
+    fraction: np.ndarray | None = None,
     draws: np.ndarray | None = None,
 ) -> xr.Dataset:
     """What a pointwise study finds.
 
-    coef, weight, share: (equation, term, z, r); share: of the bootstraps that have a term.
+    coef, weight, fraction: (equation, term, z, r); fraction: of the bootstraps that have a term.
     lost: (z, r), points without plasma. terms: with the units of their coefficients.
     draws: (draw, equation, term, z, r), weights of bootstraps; without them two agree with all.
     """
@@ -58,7 +58,7 @@ def point_study(
     found = {
         "coef": coef,
         "weight": weight,
-        "inclusion": np.ones_like(weight) if share is None else share,
+        "inclusion": np.ones_like(weight) if fraction is None else fraction,
         "weight_draws": np.stack([weight] * 2) if draws is None else draws,
     }
     held = xr.DataArray(~lost, dims=dims[3:])

@@ -6,7 +6,8 @@ the command that gives it stands before it, in a comment that readers do not see
     <!-- ep2sindy +exp=breathing verbose=true -->
 
 A number in the text is followed by its place in the `summary.json` of the first command that stands
-on the page in this way, and by its format: `97 %<!-- models.simple.living.share_reaching .0% -->`.
+on the page in this way, and by its format: `97 %<!-- models.simple.sustained.basin_stability .0%
+-->`.
 """
 
 import re

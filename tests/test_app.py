@@ -19,11 +19,11 @@ from ep2sindy.selection.criteria import Selection
 from ep2sindy.studies.study import (
     Count,
     Deferred,
+    Fraction,
     Levels,
     Names,
     PositiveOrAll,
     Positives,
-    Share,
 )
 from tests.programs import ended
 
@@ -42,7 +42,7 @@ class Toy:
 
     method: AnyMethod
     n: Count
-    share: Share
+    fraction: Fraction
     span: PositiveOrAll
     names: Names
     lengths: Positives
@@ -65,7 +65,7 @@ bootstraps: {_target_: ep2sindy.Bootstraps, n: 0}
 selection: {_target_: ep2sindy.Knee}
 depth: 2
 n: 3
-share: 0.25
+fraction: 0.25
 span: null
 names: [a, b]
 lengths: [10, 20]
@@ -89,7 +89,7 @@ def test_a_study_is_built_from_its_signature() -> None:
     study = study_of(Toy, config())
     assert study.method.depth == 2
     assert isinstance(study.method.search, ep.BestSubset)
-    assert (study.n, study.share, study.span, study.switch) == (3, 0.25, None, False)
+    assert (study.n, study.fraction, study.span, study.switch) == (3, 0.25, None, False)
     assert (study.names, study.lengths, study.noises) == (["a", "b"], [10, 20], [0.0, 0.1])
     assert study.inner == Inner(1.0)
     assert study.many == {"one": Inner(2.0, "x")}
@@ -110,7 +110,7 @@ def test_a_recipe_stands_for_its_groups() -> None:
     [
         ("nn=1", r"unknown keys \['nn'\]; near it is n; there are \["),
         ("n=0", "n must be a whole number, one or more: got 0"),
-        ("share=1", "share must be a number between 0 and 1: got 1"),
+        ("fraction=1", "fraction must be a number between 0 and 1: got 1"),
         ("span=-1", "span must be a positive number, or null for all: got -1"),
         ("names=[a,a]", r"names must be a list such as \[a,b\], each once"),
         ("lengths=[0]", r"lengths\[0\] must be numbers, above zero: got 0"),
@@ -144,7 +144,7 @@ def test_a_setting_that_cannot_be_is_refused_by_its_place(change: str, message: 
 @pytest.mark.parametrize(
     ("key", "message"),
     [
-        ("share", "the config of this experiment must have 'share'"),
+        ("fraction", "the config of this experiment must have 'fraction'"),
         ("search", "must have 'search': choose one with search=NAME"),
     ],
 )
@@ -239,14 +239,14 @@ def test_a_sweep_goes_on_after_a_failed_job_and_says_so(
         "-m", "+exp=mine", "data=file", "data.path=none.nc", "trajectory.states=[x,y]", "seed=-1,2"
     )
     assert error == "error: 2 jobs failed"
-    said = capsys.readouterr()
+    stated = capsys.readouterr()
     for text in ("job 0: ", "job 1: ", "ep2sindy compare outputs", "seed must be a whole number"):
-        assert text in said.out
+        assert text in stated.out
     paths = sorted(here.glob("outputs/multirun/*/jobs/*.json"))
     errors = [read_json(path.read_text())["error"] for path in paths]
     assert errors[0] == "seed must be a whole number, zero or more: got -1"
     assert errors[1].startswith("no such file: ")
-    assert "Traceback" not in said.err
+    assert "Traceback" not in stated.err
 
 
 def test_a_launcher_of_an_extra_names_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -54,7 +54,7 @@ def test_a_waveform_of_few_harmonics_comes_back(n_periods):
     )
     np.testing.assert_allclose(cycle.std, exact, rtol=1e-4)
     np.testing.assert_allclose(cycle.mean, [3.0, -1.0], atol=1e-3)
-    assert cycle.share == pytest.approx(1.0, abs=1e-3)
+    assert cycle.fraction == pytest.approx(1.0, abs=1e-3)
     phase = cycle.phase[::7]
     np.testing.assert_allclose(cycle.waveform(phase), spiky(t)[::7], atol=1e-2)
 
@@ -65,7 +65,7 @@ def test_white_noise_averages_out():
     clean = find_cycle(t, spiky(t))
     std = spiky(t).std(axis=0)
     noisy = find_cycle(t, spiky(t) + rng.normal(size=(len(t), 2)) * std)  # as much as signal
-    assert noisy.share > 0.95
+    assert noisy.fraction > 0.95
     assert noisy.frequency_Hz == pytest.approx(F_HZ, rel=1e-3)
     # 13 coefficients of 3240 samples: sqrt(13/3240) = 6 % of the noise.
     assert np.all(waveform_errors(clean, noisy) < 0.13)
@@ -121,11 +121,11 @@ def test_waveforms_are_compared_at_their_best_shift():
     assert np.max(waveform_errors(data, find_cycle(t, lag))) > 0.1
 
 
-def noisy_wave(share: float, *, n_periods: int = 50) -> tuple[ep.Trajectory, np.ndarray]:
+def noisy_wave(fraction: float, *, n_periods: int = 50) -> tuple[ep.Trajectory, np.ndarray]:
     """A wave with one overtone in white noise, given in its standard deviations; and the wave."""
     t = np.linspace(0.0, float(n_periods), 40 * n_periods + 1)
     wave = 3.0 + np.cos(2.0 * np.pi * t) + 0.5 * np.sin(4.0 * np.pi * t)
-    noise = share * wave.std() * np.random.default_rng(0).normal(size=len(t))
+    noise = fraction * wave.std() * np.random.default_rng(0).normal(size=len(t))
     inputs = np.arange(len(t), dtype=np.float64)[:, None]
     return ep.Trajectory(t, (wave + noise)[:, None], ["x"], inputs, ["u"], label="wave"), wave
 

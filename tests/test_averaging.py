@@ -36,17 +36,17 @@ def test_the_law_of_a_long_record_is_found_in_its_means() -> None:
     assert words == "means over 14 samples: 2142 are left; decimate=None takes all samples"
     assert found.model.terms("x") == pytest.approx({"v": 1.0}, abs=2e-3)
     assert found.model.terms("v") == pytest.approx({"x": -1.0}, abs=2e-3)
-    assert not found.misfit
+    assert not found.lack_of_fit
 
 
 def test_an_input_that_is_held_is_averaged_with_the_states() -> None:
-    """Half a step of lag between means of states and of the input would show as a late channel."""
+    """A lag of half a step between means of states and input would show as a delayed channel."""
     run = damped(held=400)
     library = ep.polynomial(["x", "v", "u"], degree=1)
     method = ep.TrajectorySearch(courses={"u": "held"})
     found = ep.discover(run, library, method)
     assert found.model.terms("v") == pytest.approx({"x": -1.0, "v": -0.2, "u": 2.0}, abs=3e-3)
-    assert not found.misfit
+    assert not found.lack_of_fit
     assert found.model.courses == {"u": "linear"}
     assert of_means(ep.TrajectorySearch()) == ep.TrajectorySearch()
 

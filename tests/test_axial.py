@@ -10,7 +10,7 @@ from benchmarks.hallthruster import calibrated_run
 from ep2sindy.thruster.axial.electron_kernels import solve_from_both_ends
 from ep2sindy.thruster.axial.model import cell_faces
 from ep2sindy.thruster.propellants import PropellantTable
-from ep2sindy.thruster.verdict import cycle_peaks, diagnose, judge_status, multiplicity
+from ep2sindy.thruster.verdict import assess_status, cycle_peaks, diagnose, multiplicity
 from tests.thrusters import POINT, brief
 
 ZONE = (0.015, 0.025)
@@ -177,8 +177,8 @@ def test_two_charges_are_ionised_further():
     thruster = ep.thruster.Thruster(propellant=ep.thruster.propellant("xenon"), charge_states=2)
     field = brief(thruster)
     assert "average_of" not in field["ionization"].attrs  # rates of its own ionise the second
-    share = float((field["n_i2"] / field["n_i"]).mean())
-    assert 1e-3 < share < 0.3
+    fraction = float((field["n_i2"] / field["n_i"]).mean())
+    assert 1e-3 < fraction < 0.3
     exit_speed = field["u_iz2"].isel(z=-1).mean() / field["u_iz"].isel(z=-1).mean()
     assert 1.1 < float(exit_speed) < 1.5  # sqrt(2) for ions that fell all the way
 
@@ -202,7 +202,7 @@ def test_a_stretched_grid_has_long_cells_in_the_plume():
 )
 def test_a_transit_oscillation_is_told_from_breathing(f_Hz, status):
     t = 1.5e-6 * np.arange(4000)
-    assert judge_status(4.0 + np.sin(2e0 * np.pi * f_Hz * t), 1.5e-6) == status
+    assert assess_status(4.0 + np.sin(2e0 * np.pi * f_Hz * t), 1.5e-6) == status
 
 
 def verdict_on(current, *, diverged=False):

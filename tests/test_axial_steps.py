@@ -96,12 +96,12 @@ def rates_of(n, g, nn, state, model):
     for (below, above), rate in zip(model.further.astype(int), state.rates[1:], strict=True):
         source, speed = (n[below - 1], g[below - 1] / n[below - 1]) if below else (nn, None)
         born = rate * n_e * source
-        push = born * (model.birth_speed if speed is None else speed)
+        momentum_gain = born * (model.birth_speed if speed is None else speed)
         d_n[above - 1] += born
-        d_g[above - 1] += push
+        d_g[above - 1] += momentum_gain
         if below:
             d_n[below - 1] -= born
-            d_g[below - 1] -= push
+            d_g[below - 1] -= momentum_gain
         else:
             consumed += born
     before, behind, at_anode, faces, walls = model.per_before, model.per_behind, 0.0, [], []
@@ -109,12 +109,12 @@ def rates_of(n, g, nn, state, model):
         k, lost = z - 1, np.sqrt(z) * state.wall_loss
         flux, momentum = through_faces(n[k], g[k], z, model)
         widening = model.sound_speed_squared * n[k] * (behind - before)
-        push = z * E_CHARGE / model.ion_mass * n[k] * state.E + widening
+        momentum_gain = z * E_CHARGE / model.ion_mass * n[k] * state.E + widening
         d_n[k, INNER] += (flux[:-1] * before[INNER] - flux[1:] * behind[INNER]) - (lost * n[k])[
             INNER
         ]
         d_g[k, INNER] += momentum[:-1] * before[INNER] - momentum[1:] * behind[INNER]
-        d_g[k, INNER] += (push - lost * g[k])[INNER]
+        d_g[k, INNER] += (momentum_gain - lost * g[k])[INNER]
         d_nn += lost * n[k]
         at_anode += flux[0]
         faces.append(flux)

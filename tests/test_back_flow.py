@@ -12,7 +12,7 @@ def test_where_ions_flow_back_a_law_is_found_that_lives(tmp_path: Path) -> None:
     found = computed(
         composed(
             "+exp=breathing",
-            "living=back_flow",
+            "sustained=back_flow",
             "thruster=lif",
             "data.operating_point.neutral_speed=220",
             "~libraries.ionization",

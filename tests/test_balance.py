@@ -9,7 +9,7 @@ import xarray as xr
 import ep2sindy as ep
 from ep2sindy.library.roles import constraint_of, sum_known
 from ep2sindy.studies.balance import model_balance
-from ep2sindy.studies.processes import Zones, compared_processes, told_roles
+from ep2sindy.studies.processes import Zones, compared_processes, stated_roles
 from ep2sindy.studies.source import split_in_time
 from tests.thrusters import brief
 
@@ -53,8 +53,8 @@ def test_the_supply_is_the_mass_flow(field: xr.Dataset, exact: xr.Dataset) -> No
     assert field.attrs["neutral_inflow"] == pytest.approx(particles)
     length_m = float(field["dz"].values[field["z"].values <= 0.025].sum())
     assert exact["supply"].values == pytest.approx(particles / length_m, rel=1e-5)
-    told = told_roles({"": exact}, ep.zone_average(field, CHANNEL, states=STATES))
-    assert told["n_n in"].terms == {"1": pytest.approx(particles / length_m, rel=1e-5)}
+    stated = stated_roles({"": exact}, ep.zone_average(field, CHANNEL, states=STATES))
+    assert stated["n_n in"].terms == {"1": pytest.approx(particles / length_m, rel=1e-5)}
 
 
 def test_what_leaves_and_comes_back_is_told_by_least_squares(exact: xr.Dataset, data) -> None:
@@ -63,11 +63,11 @@ def test_what_leaves_and_comes_back_is_told_by_least_squares(exact: xr.Dataset, 
     made = exact.assign(
         exit_n=("time", 3e3 * n_n + 2e-16 * n_i * n_n), returned=("time", 1e5 * n_i)
     )
-    told = told_roles({"": made}, data)
-    assert told["n_n out"].terms == pytest.approx({"n_n": 3e3, "n_i*n_n": 2e-16}, rel=1e-6)
-    assert told["n_i to n_n"].terms == pytest.approx({"n_i": 1e5}, rel=1e-6)
-    assert told["n_n out"].r2 == pytest.approx(1.0)
-    half = told_roles({"": made}, data.window(0, data.n_samples // 2))
+    stated = stated_roles({"": made}, data)
+    assert stated["n_n out"].terms == pytest.approx({"n_n": 3e3, "n_i*n_n": 2e-16}, rel=1e-6)
+    assert stated["n_i to n_n"].terms == pytest.approx({"n_i": 1e5}, rel=1e-6)
+    assert stated["n_n out"].r2 == pytest.approx(1.0)
+    half = stated_roles({"": made}, data.window(0, data.n_samples // 2))
     assert half["n_i to n_n"].terms == pytest.approx({"n_i": 1e5}, rel=1e-6)
 
 
@@ -76,8 +76,8 @@ def test_a_field_without_averages_gives_nearly_the_same(field: xr.Dataset, exact
     found = ep.thruster.zone_balance(plain, CHANNEL)
     assert set(found) == {"change_i", "change_n", "ionization", "exit_i", "returned", "exit_n",
                           "supply"}  # fmt: skip
-    for name, share in (("ionization", 0.02), ("supply", 0.01), ("exit_i", 0.05)):
-        assert float(found[name].mean()) == pytest.approx(float(exact[name].mean()), rel=share)
+    for name, fraction in (("ionization", 0.02), ("supply", 0.01), ("exit_i", 0.05)):
+        assert float(found[name].mean()) == pytest.approx(float(exact[name].mean()), rel=fraction)
 
 
 def test_a_file_gives_what_it_can(field: xr.Dataset) -> None:
@@ -90,7 +90,7 @@ def test_a_file_gives_what_it_can(field: xr.Dataset) -> None:
     downstream = ep.thruster.zone_balance(field, ep.Zone(z="downstream"))
     assert "supply" not in downstream  # what enters through an inner face is not known beforehand
     run = ep.zone_average(field, ep.Zone(z="downstream"), states=STATES)
-    assert "n_n in" not in told_roles({"": downstream}, run)
+    assert "n_n in" not in stated_roles({"": downstream}, run)
 
 
 @pytest.fixture(scope="module")
@@ -108,13 +108,13 @@ def under(roles: ep.Roles, values: dict[tuple[str, str], float]):
     """The model whose processes have these coefficients, by role and term, and its constraint."""
     library = ep.polynomial(STATES, degree=2)
     chosen = [p for p in roles.processes(library, STATES) if (p.role, p.term) in values]
-    held_to = constraint_of(library, STATES, chosen, roles.told)
+    held_to = constraint_of(library, STATES, chosen, roles.stated)
     assert held_to is not None
-    known = sum_known(roles.told)
+    known = sum_known(roles.stated)
     coef = np.array([known.get(at, 0.0) for at in held_to.coefficients])
     for process in chosen:
-        shares = [process.factors.get(at, 0.0) for at in held_to.coefficients]
-        coef += values[process.role, process.term] * np.array(shares)
+        fractions = [process.factors.get(at, 0.0) for at in held_to.coefficients]
+        coef += values[process.role, process.term] * np.array(fractions)
     terms: dict[str, dict[str, float]] = {state: {} for state in STATES}
     for (state, term), value in zip(held_to.coefficients, coef.tolist(), strict=True):
         terms[state][term] = value
@@ -148,9 +148,9 @@ def test_processes_of_a_conserving_model(data: ep.Trajectory, exact: xr.Dataset)
 
 def test_what_ions_give_back_by_a_process_of_their_own_is_compared(data, exact) -> None:
     """Told or found, it stands beside what walls and anode give back, and ionization is whole."""
-    told = replace(ROLES, exchange=[("n_n", "n_i"), ("n_i", "n_n", {"n_i": 1e5})])
+    stated = replace(ROLES, exchange=[("n_n", "n_i"), ("n_i", "n_n", {"n_i": 1e5})])
     free = VALUES | {("n_i to n_n", "n_i"): 1e5}
-    for roles, values in ((told, VALUES), (ROLES, free)):
+    for roles, values in ((stated, VALUES), (ROLES, free)):
         compared = compared_processes(*under(roles, values), data, Zones({"": exact}))
         found = {each.name: each for each in compared}
         np.testing.assert_allclose(found["neutrals that become ions"].recorded, exact["ionization"])
@@ -198,25 +198,25 @@ def test_terms_left_out_go_with_those_that_follow_them(data: ep.Trajectory, exac
     assert without.model.terms("n_n")["1"] == 2e23
 
 
-@pytest.mark.parametrize("told", [True, False])
-def test_a_process_left_out_leaves_those_that_share_its_coefficient(data, exact, told) -> None:
-    """Of what ions lose by n_i, what leaves goes and what comes back stays, told or found."""
+@pytest.mark.parametrize("stated", [True, False])
+def test_a_process_left_out_leaves_those_that_share_its_coefficient(data, exact, stated) -> None:
+    """Of what ions lose by n_i, what leaves goes and what comes back stays, stated or found."""
     back = ("n_i to n_n", "n_i")
     values = {("n_n to n_i", "n_i*n_n"): 5e-14, ("n_i out", "n_i"): 4e5, ("n_n out", "n_n"): 3e3}
     roles = replace(ROLES, exchange=[("n_n", "n_i"), ("n_i", "n_n", {"n_i": 1e5})])
-    model, held_to = under(roles, values) if told else under(ROLES, values | {back: 1e5})
+    model, held_to = under(roles, values) if stated else under(ROLES, values | {back: 1e5})
     parts = split_in_time(data, 0.25)
     beside = model_balance(
         model, held_to, data, *parts, Zones({"": exact}), ep.model.FreeRunBounds()
     )
     found = {(each.part.split(",")[0], each.term): each for each in beside.terms}
     returned = found["ions that become neutrals", "n_i"]
-    assert returned.is_known == told
+    assert returned.is_known == stated
     without = found["ions that leave", "n_i"].without
     assert without is not None
     kept = {state: without.model.terms(state) for state in STATES}
     assert kept["n_n"]["n_i"] == -kept["n_i"]["n_i"]
-    if told:
+    if stated:
         assert (returned.status, kept["n_n"]["n_i"]) == ("known", 1e5)
     else:
         assert returned.without is not None

@@ -16,11 +16,13 @@ from ep2sindy.forecasting.baselines import (
 )
 
 
-def oscillator(n: int = 3000, *, pushed: float = 0.01, level: float = 0.1) -> np.ndarray:
-    """An autoregression of order two that is pushed at random at every step."""
+def oscillator(
+    n: int = 3000, *, with_process_noise: float = 0.01, level: float = 0.1
+) -> np.ndarray:
+    """An autoregression of order two that is moved at random at every step."""
     rng, x = np.random.default_rng(0), [0.0, 0.0]
     for _ in range(n):
-        x.append(1.6 * x[-1] - 0.9 * x[-2] + level + pushed * rng.standard_normal())
+        x.append(1.6 * x[-1] - 0.9 * x[-2] + level + with_process_noise * rng.standard_normal())
     return np.array(x[2:])
 
 
@@ -56,7 +58,7 @@ def test_several_states_regress_on_each_other() -> None:
 
 
 def test_positive_signals_regress_in_logarithms_where_these_are_likelier() -> None:
-    x = oscillator(pushed=0.3)
+    x = oscillator(with_process_noise=0.3)
     assert Autoregression.of(record(np.exp(x))).least is not None
     assert Autoregression.of(record(x + 20.0)).least is None
     grows = record(np.exp(x))
@@ -94,7 +96,7 @@ def test_missing_samples_and_other_steps_are_interpolated() -> None:
 
 
 def test_rows_do_not_lead_across_a_gap() -> None:
-    """The second stretch is turned over: a row across the gap would say so."""
+    """The second segment is turned over: a row across the gap would say so."""
     t = np.arange(600.0)
     x = np.sin(0.4 * t)
     x[300:] *= -1.0

@@ -16,7 +16,7 @@ from ep2sindy.thruster.plane.simulate import OPERATING_POINT_2D, THRUSTER_2D
 from tests.thrusters import POINT, brief
 
 COIL = ep.thruster.Circuit(inductance=1e-4)
-SINE = ep.thruster.ModulatedVoltage(share=0.05, frequency_Hz=2e4)
+SINE = ep.thruster.ModulatedVoltage(fraction=0.05, frequency_Hz=2e4)
 
 
 def driven(supply, **settings):
@@ -129,7 +129,7 @@ def test_a_voltage_is_read_from_a_file(tmp_path: Path):
             lambda: ep.thruster.Thruster(series_resistance=0.0, circuit=COIL),
             "a circuit must have a resistance, .*: series_resistance is 0",
         ),
-        (lambda: ep.thruster.ModulatedVoltage(1.2, 1e4), "share must be below 1, .*, got 1.2"),
+        (lambda: ep.thruster.ModulatedVoltage(1.2, 1e4), "fraction must be below 1, .*, got 1.2"),
         
         (lambda: ep.thruster.VoltageTable((0.0, 1.0), (300.0, 0.0)), "everywhere, got 0 V"),
         (

@@ -85,8 +85,8 @@ def test_without_rows_the_best_by_r2_come_first() -> None:
 
 def test_relations_hold_in_every_combination_that_a_cap_leaves() -> None:
     fronts = [front("x", [0.0, 1.0, 2.0]), front("y", [0.0, 1.0, 2.0])]
-    tied = relations_of(["x: b == -1 * y: b"])
-    assert combinations(fronts, 2, tied).tolist() == [[0, 0], [0, 1]]
+    coupled = relations_of(["x: b == -1 * y: b"])
+    assert combinations(fronts, 2, coupled).tolist() == [[0, 0], [0, 1]]
     known = relations_of(["x: b == -1 * y: b", "y: b == 3"])
     assert combinations(fronts, 1, known).tolist() == [[2, 2]]
     with pytest.raises(ValueError, match="name terms that no combination of candidates has"):

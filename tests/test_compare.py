@@ -56,8 +56,8 @@ def test_two_runs_are_set_side_by_side(
 ) -> None:
     page = tmp_path / "pages" / "both.html"
     compare([*map(str, runs), "--page", str(page)])
-    said = capsys.readouterr().out
-    rows = [" ".join(line.replace("│", " ").split()) for line in said.splitlines()]
+    stated = capsys.readouterr().out
+    rows = [" ".join(line.replace("│", " ").split()) for line in stated.splitlines()]
     for row in (
         "search.max_terms 3 4",
         "one: frequency 1.5 kHz 2 kHz +33 %",
@@ -110,9 +110,9 @@ def test_the_jobs_of_a_sweep_are_compared_but_for_those_that_failed(
     write_json(sweep / "jobs" / "0.json", {"folder": str(runs[0])})
     capsys.readouterr()
     compare([str(sweep), "--page", str(page)])
-    said = capsys.readouterr().out
-    assert said.startswith("left out: job 10 failed: no\n")
-    assert "search.max_terms" in said
+    stated = capsys.readouterr().out
+    assert stated.startswith("left out: job 10 failed: no\n")
+    assert "search.max_terms" in stated
     assert page.is_file()
     write_json(sweep / "jobs" / "3.json", {"folder": 1})
     with pytest.raises(ValueError, match=r"3\.json cannot be read: it is damaged"):
@@ -128,7 +128,7 @@ def test_runs_in_years_are_compared_in_years(
         summary |= {"data": {"time_unit": "year"}, "headline": {"one/f_kHz": 0.1e-3 / year}}
         (folder / "summary.json").write_text(json.dumps(summary))
     compare([*map(str, runs), "--page", str(tmp_path / "page.html")])
-    said = capsys.readouterr().out
-    assert "0.1 per year" in said
-    assert f"A: x' = -{2.0 * year:.3g} x [m year^-1]" in said
-    assert f"-{2.0 * year:.4g} ±{0.1 * year:.2g}" in said
+    stated = capsys.readouterr().out
+    assert "0.1 per year" in stated
+    assert f"A: x' = -{2.0 * year:.3g} x [m year^-1]" in stated
+    assert f"-{2.0 * year:.4g} ±{0.1 * year:.2g}" in stated

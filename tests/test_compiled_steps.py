@@ -6,7 +6,7 @@ import torch
 
 import ep2sindy as ep
 from ep2sindy.model import stability
-from ep2sindy.model.stability import LimitCycle, share_reaching
+from ep2sindy.model.stability import LimitCycle, basin_stability
 from ep2sindy.model.vector_field import VectorField
 from ep2sindy.refinement.kernels import condense, propagate, starts
 from ep2sindy.refinement.ode import ODE, Drive, ScaledEquations
@@ -58,13 +58,13 @@ def test_starts_that_a_kernel_brings_near_the_end_reach_what_a_loop_reaches(
     t = np.linspace(0.0, 2.0 * np.pi, 200, endpoint=False)
     states = 2.0 * np.stack([np.sin(t), np.cos(t)], axis=1)
     cycle = LimitCycle(6.6, states, np.array([1.0, 0.001]), model)
-    found = share_reaching(model, cycle, n_starts=32, n_periods=8.0)
+    found = basin_stability(model, cycle, n_starts=32, n_periods=8.0)
 
     def as_they_are(field: VectorField, y: np.ndarray, *_: object) -> tuple:
         return y, np.zeros(len(y)), np.full(len(y), 100_000)
 
     monkeypatch.setattr(stability, "_approach", as_they_are)
-    assert share_reaching(model, cycle, n_starts=32, n_periods=8.0) == found
+    assert basin_stability(model, cycle, n_starts=32, n_periods=8.0) == found
     assert 0.0 <= found < 1.0
 
 

@@ -108,10 +108,13 @@ def test_relations_are_read(text: str, factors: list[tuple[float, str, str]], va
     ("text", "message"),
     [
         ("x: x", "two sides joined by one '=='"),
-        ("1 == 2", "must name a coefficient: '1 == 2'"),
-        ("x: x == 1e999", "must be finite: 'x: x == 1e999'"),
-        ("x: x == ", r"a number must stand at character 9 of the relation 'x: x == ': 'the end'"),
-        ("x: x y: y == 0", r"\+, -, == or the end must stand at character 6 .*'y, got y == 0'"),
+        ("1 == 2", "must name a coefficient, got '1 == 2'"),
+        ("x: x == 1e999", "must be finite, got 'x: x == 1e999'"),
+        (
+            "x: x == ",
+            r"a number must stand at character 9 of the relation 'x: x == ', got 'the end'",
+        ),
+        ("x: x y: y == 0", r"\+, -, == or the end must stand at character 6 .*'y: y == 0'"),
         ("x: x + 2 * foo == 0", r"character 10 .*'\* foo == 0'; write it like 'n_i: n"),
     ],
 )
@@ -201,12 +204,12 @@ def test_the_matrix_of_the_thesis_is_its_formula() -> None:
 
 
 def test_the_matrix_may_scale_what_it_shares() -> None:
-    shares = {"x": 0.77, "y": -0.82, "z": 0.1}
+    fractions = {"x": 0.77, "y": -0.82, "z": 0.1}
     support = {"x": ["x*y"], "y": ["x*y"], "z": ["x*y", "1"]}
-    relations = [f"{shares[s]} * x: x*y == 0.77 * {s}: x*y" for s in ("y", "z")]
+    relations = [f"{fractions[s]} * x: x*y == 0.77 * {s}: x*y" for s in ("y", "z")]
     c = constraint(LIBRARY, support, relations)
     coef = dict(zip(c.coefficients, c.coef(np.array([5.0, 7.0])), strict=True))
-    shared = np.array([coef[s, "x*y"] / share for s, share in shares.items()])
+    shared = np.array([coef[s, "x*y"] / fraction for s, fraction in fractions.items()])
     np.testing.assert_allclose(shared, shared[0], rtol=1e-14)
 
 
@@ -299,15 +302,15 @@ def test_an_equation_of_large_units_does_not_swamp_the_other() -> None:
     theta, target = random_rows()
     plain = rows_of(theta, target)
     large = rows_of(theta, target * [1.0, 1e20])
-    tied = constraint(plain[0].library, SUPPORT, [TIED])
+    coupled = constraint(plain[0].library, SUPPORT, [TIED])
     tied_large = constraint(plain[0].library, SUPPORT, ["1e20 * x: x*y == -1 * y: x*y"])
-    expected = constrained_fit(plain, tied)
+    expected = constrained_fit(plain, coupled)
     model = constrained_fit(large, tied_large)
     np.testing.assert_allclose(model.coef, expected.coef * [1.0, 1e20], rtol=1e-9)
     # The noise in y' is 4 times that in x': the weights are 16 to 1 at any units.
     alone = [np.linalg.lstsq(theta[:, [k, 2]], target[:, k], rcond=None)[0][1] for k in (0, 1)]
-    share = (model.terms("x")["x*y"] + alone[1]) / (alone[0] + alone[1])
-    assert share == pytest.approx(16 / 17, abs=0.03)
+    fraction = (model.terms("x")["x*y"] + alone[1]) / (alone[0] + alone[1])
+    assert fraction == pytest.approx(16 / 17, abs=0.03)
 
 
 def test_exact_equations_weigh_a_million_times_their_targets_and_no_more() -> None:
@@ -351,12 +354,12 @@ def test_covariance_follows_the_library_of_the_rows() -> None:
 @FORMULATIONS
 def test_a_true_relation_makes_coefficients_more_accurate(formulation: Formulation) -> None:
     """b = c = 1: two equations tell of one number."""
-    errors: dict[str, list[np.ndarray]] = {"free": [], "tied": []}
+    errors: dict[str, list[np.ndarray]] = {"free": [], "coupled": []}
     for seed in range(8):
         problems = formulation.assemble([noisy_run(seed)], LIBRARY, rng=np.random.default_rng(0))
-        for name, relations in (("free", []), ("tied", [TIED])):
+        for name, relations in (("free", []), ("coupled", [TIED])):
             model = constrained_fit(problems, constraint(LIBRARY, SUPPORT, relations))
             errors[name].append(model.coef[4] - [-1.0, 1.0])
-    free, tied = (np.sqrt(np.square(e).mean()) for e in errors.values())
+    free, coupled = (np.sqrt(np.square(e).mean()) for e in errors.values())
     assert LIBRARY.names[4] == "x*y"
-    assert tied < 0.85 * free  # 0.71 if the errors of the two were independent and alike
+    assert coupled < 0.85 * free  # 0.71 if the errors of the two were independent and alike

@@ -38,21 +38,21 @@ def test_dry_friction_is_found_with_its_width() -> None:
     run = truth.simulate(np.linspace(0.0, 8.0, 1601), [0.5, 0.0]).trajectory()
     seen = []
 
-    def misfit(functions: list[str]) -> float:
+    def lack_of_fit(functions: list[str]) -> float:
         tried = ep.polynomial(["x", "v"], degree=1, functions=functions)
         theta, rate = tried.evaluate(run.states), truth.predict(run)[:, 1]
         left = rate - theta @ np.linalg.lstsq(theta, rate, rcond=None)[0]
         seen.append(tried)
         return float(left @ left)
 
-    (found,) = fit_functions(["sign(?*v)"], run, misfit)
+    (found,) = fit_functions(["sign(?*v)"], run, lack_of_fit)
     factor = float(found.removeprefix("sign(").removesuffix("*v)"))
     assert factor == pytest.approx(10.0, rel=0.02)
     assert len(seen) < 40
     (summand,) = fit_functions(["1/(?+x)"], run, lambda tried: 1.0)
     assert summand.startswith("1/(")
     with pytest.raises(ValueError, match=r"must have one \? and one variable of \['x', 'v'\]"):
-        fit_functions(["sign(?*v+?)"], run, misfit)
+        fit_functions(["sign(?*v+?)"], run, lack_of_fit)
     with pytest.raises(ValueError, match=r"no number in the place of \?"):
         fit_functions(["sign(?*v)"], run, lambda tried: np.inf)
 

@@ -76,16 +76,16 @@ def test_permuting_the_library_changes_nothing() -> None:
         assert permuted == pytest.approx(terms, rel=1e-9)
 
 
-# By the joint search, and by regression; what is said where 21 counts are few.
+# By the joint search, and by regression; what is reported where 21 counts are few.
 FEW = [
     (None, "21 samples do not tell which of 6 terms (30 would): 2 an equation at most were tried"),
     (RECIPES[0], "13 rows are few for 6 terms: equations of lynx were searched with at most 2"),
 ]
 
 
-@pytest.mark.parametrize(("recipe", "said"), FEW, ids=["joint", "regression"])
+@pytest.mark.parametrize(("recipe", "stated"), FEW, ids=["joint", "regression"])
 def test_hare_and_lynx_are_predator_and_prey_in_21_counts(
-    recipe: AnyMethod | None, said: str
+    recipe: AnyMethod | None, stated: str
 ) -> None:
     """Least squares of whole trajectories gives 0.481, 0.0248, 0.926 and 0.0275."""
     found = discover(PELTS, None, recipe)
@@ -94,7 +94,7 @@ def test_hare_and_lynx_are_predator_and_prey_in_21_counts(
     for state, terms in truth.items():
         assert found.model.terms(state) == pytest.approx(terms, rel=0.05)
     notes = [found.note, *(a.message for a in found.ambiguities)]
-    assert any(note.startswith(said) for note in notes)
+    assert any(note.startswith(stated) for note in notes)
     run = found.model.rollout(PELTS)
     assert not run.diverged
     assert run.states.max() < 2.0 * PELTS.states.max()
@@ -118,7 +118,7 @@ def test_what_an_equation_leaves_tells_whether_a_term_is_missing(recipe: AnyMeth
         assert left.chi_squared == pytest.approx(1.0, abs=0.3)
         assert left.autocorrelation == pytest.approx(0.0, abs=0.2)
         assert left.leaves_noise
-    assert found.misfit == ""
+    assert found.lack_of_fit == ""
     if recipe is not PLAIN:  # whose rows know nothing of their noise
         low, high = found.model.intervals("x")["x*y"]
         assert low < found.model.terms("x")["x*y"] < high < low + 0.1
@@ -126,8 +126,8 @@ def test_what_an_equation_leaves_tells_whether_a_term_is_missing(recipe: AnyMeth
     left = lacking.noise_test.left.values()
     assert not any(each.leaves_noise for each in left)
     assert min(each.autocorrelation for each in left) > 0.3
-    assert "no equation of this library leaves white noise of x'" in lacking.misfit
-    assert lacking.misfit in lacking.note
+    assert "no equation of this library leaves white noise of x'" in lacking.lack_of_fit
+    assert lacking.lack_of_fit in lacking.note
     assert lacking.model.covariance is None
 
 
@@ -137,7 +137,7 @@ def test_an_equation_without_terms_is_a_misfit_where_its_state_moves() -> None:
     rule = EBIC(gamma=0.0, coarsening=None)
     found = discover(run, only_one, replace(PLAIN, selection=rule))
     assert {chosen.terms for chosen in found.chosen.values()} == {()}
-    assert "x'" in found.misfit
+    assert "x'" in found.lack_of_fit
 
 
 FORMS = [Differential(), Weak(), WeightedWeak()]
@@ -148,14 +148,14 @@ def test_relations_that_the_data_contradict_are_a_misfit(formulation: Formulatio
     run = lotka_volterra().trajectory(noise=0.05, rng=0)
     recipe, library = Regression(formulation), polynomial(["x", "y"])
     right = discover(run, library.relate("x: x*y == -1"), recipe)
-    assert right.misfit == ""
+    assert right.lack_of_fit == ""
     assert right.model.covariance is not None
     wrong = discover(run, library.relate("x: x == 5"), recipe)
     assert wrong.model.terms("x")["x"] == 5.0
     assert not wrong.noise_test.left["x"].leaves_noise
     assert wrong.noise_test.left["y"].leaves_noise
-    assert "white noise of x'" in wrong.misfit
-    assert "check the relations" in wrong.misfit
+    assert "white noise of x'" in wrong.lack_of_fit
+    assert "check the relations" in wrong.lack_of_fit
     assert wrong.model.covariance is None
 
 
@@ -241,11 +241,11 @@ def test_a_rule_that_judges_free_runs_says_a_misfit_where_others_do() -> None:
     recipe = Regression(WeightedWeak(), BestSubset(max_terms=2), rule, Bootstraps(n=0))
     found = discover(run, named_terms(["x", "y"], ["x", "y", "x*y"]), recipe)
     assert found.noise_test.tested
-    assert found.misfit == ""
+    assert found.lack_of_fit == ""
     poor = discover(run, named_terms(["x", "y"], ["x", "y"]), recipe)
-    assert "leaves white noise of x'" in poor.misfit
+    assert "leaves white noise of x'" in poor.lack_of_fit
     by_rows = discover(run, named_terms(["x", "y"], ["x", "y"]), replace(recipe, selection=EBIC()))
-    assert "leaves white noise of x'" in by_rows.misfit
+    assert "leaves white noise of x'" in by_rows.lack_of_fit
 
 
 def test_the_test_of_a_trajectory_search_is_not_that_of_another_model() -> None:
@@ -255,19 +255,19 @@ def test_the_test_of_a_trajectory_search_is_not_that_of_another_model() -> None:
     assert tested.noise_test.tested
     still = discover(run, library, TrajectorySearch(selection=BySize(sign=1)))
     assert not still.model.coef.any()
-    assert still.estimate.misfit == ""
-    assert "leaves white noise" in still.misfit
+    assert still.estimate.lack_of_fit == ""
+    assert "leaves white noise" in still.lack_of_fit
     poor = discover(
         run, library.take(np.array([True, True, False])), TrajectorySearch(selection=BySize(sign=1))
     )
-    assert poor.estimate.misfit
-    assert "leaves white noise" in poor.misfit
+    assert poor.estimate.lack_of_fit
+    assert "leaves white noise" in poor.lack_of_fit
 
 
 def test_samples_too_few_for_weak_rows_are_judged_by_none() -> None:
     run = lotka_volterra().trajectory(noise=0.05, rng=0)
     found = discover(run.window(0, 12), polynomial(["x", "y"], degree=1), PLAIN)
-    assert found.misfit == ""
+    assert found.lack_of_fit == ""
 
 
 def noise_in_pieces(n: int, rng: np.random.Generator) -> list[Trajectory]:
@@ -286,12 +286,12 @@ def test_what_a_model_leaves_at_rest_must_be_white_noise_by_any_method(recipe: A
     run = Trajectory(np.arange(float(n)), turns[:, None], ["x"])
     constant = polynomial(["x"], degree=0)
     found = discover(run, constant, recipe)
-    assert found.misfit
-    assert found.note == found.misfit
+    assert found.lack_of_fit
+    assert found.note == found.lack_of_fit
     assert found.model.covariance is None
     few = replace(run, states=rng.standard_normal((n, 1))).window(0, 20)
     still = discover(few, constant, recipe)
-    assert still.misfit == ""
+    assert still.lack_of_fit == ""
     assert still.note.startswith("no law of x is found: about a steady course")
     assert "but 20 are too few to tell" in still.note
 
@@ -300,7 +300,7 @@ def test_what_a_model_leaves_at_rest_must_be_white_noise_by_any_method(recipe: A
 def test_white_noise_about_a_steady_course_is_no_law(recipe: AnyMethod) -> None:
     runs = noise_in_pieces(160, np.random.default_rng(1))
     found = discover(runs, polynomial(["x", "y"], degree=0), recipe)
-    assert found.misfit == ""
+    assert found.lack_of_fit == ""
     assert found.noise_test.note in found.note
     assert "no law of x and y is found" in found.note
     assert "too few" not in found.note
@@ -313,4 +313,4 @@ def test_a_rest_is_judged_by_the_instants_at_which_all_was_measured() -> None:
     missing[::3, 1] = True
     run = Trajectory(t, states, ["x", "y"], missing=missing)
     found = discover(run, polynomial(["x", "y"], degree=0), PLAIN)
-    assert "leaves x at rest" in found.misfit or "noise of x'" in found.misfit
+    assert "leaves x at rest" in found.lack_of_fit or "noise of x'" in found.lack_of_fit

@@ -1,4 +1,4 @@
-"""A discovery that is stored says all that it said, and a file from someone else runs nothing."""
+"""A discovery that is stored says all that it stated, and a file from someone else runs nothing."""
 
 import json
 from dataclasses import replace
@@ -18,7 +18,7 @@ CASES: dict[str, dict[str, Any]] = {
     "trajectories": {"method": ep.TrajectorySearch(max_terms=3)},
     "regression": {"method": ep.Regression(), "library": TIED},
     "bootstraps": {"method": THESIS},
-    "runs": {"method": ep.Regression(selection=ep.FreeRunScore(judged=("x",), n_windows=4))},
+    "runs": {"method": ep.Regression(selection=ep.FreeRunScore(assessed=("x",), n_windows=4))},
 }
 
 
@@ -38,7 +38,7 @@ def test_a_discovery_comes_back_as_it_was(case: str, tmp_path: Path) -> None:
     again = ep.Discovery.load(tmp_path / "found.json")
     assert again.model == known.model
     assert again.method == known.method
-    assert again.noise_test.misfit == known.noise_test.misfit
+    assert again.noise_test.lack_of_fit == known.noise_test.lack_of_fit
     assert again.to_json() == known.to_json()
     assert repr(again) == repr(known)
     for state, front in known.fronts.items():
@@ -74,7 +74,7 @@ class Own:
 
 def test_a_method_of_ones_own_is_refused_with_the_way_out() -> None:
     own = replace(found("trajectories"), method=Own())
-    with pytest.raises(ValueError, match=r"classes of this package alone: .*found.model.save"):
+    with pytest.raises(ValueError, match=r"classes of this package alone, got .*found.model.save"):
         own.to_json()
 
 

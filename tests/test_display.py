@@ -11,7 +11,7 @@ from ep2sindy.discovery.method import Regression
 from ep2sindy.discovery.result import Discovery
 from ep2sindy.library.library import Library, named_terms, polynomial
 from ep2sindy.model.model import SparseModel, coef_matrix
-from ep2sindy.refinement.judge import RefinementStatus
+from ep2sindy.refinement.assess import RefinementStatus
 from ep2sindy.refinement.refine import Refinement, refine
 from ep2sindy.regression.ambiguity import Ambiguity
 from ep2sindy.regression.bootstraps import Bootstraps

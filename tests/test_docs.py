@@ -285,8 +285,8 @@ def test_the_messages_that_the_faq_quotes_are_those_of_the_package() -> None:
     """`...` stands for what a message says of names and numbers."""
     quotes = re.findall(r'^### "(.*)"$', (ROOT / "docs" / "faq.md").read_text("utf-8"), re.M)
     assert len(quotes) > 20
-    said = messages()
-    lost = [quote for quote in quotes if not any(is_of(quote, text) for text in said)]
+    stated = messages()
+    lost = [quote for quote in quotes if not any(is_of(quote, text) for text in stated)]
     assert not lost, "\n".join(lost)
 
 
@@ -343,6 +343,6 @@ def test_the_example_of_a_docstring_runs(name: str, here: Path) -> None:
     write_field(three_regions(n_z=6, n_r=5, n_samples=300).field, here / "run.nc")
     text = dotted_names()[name].load().__doc__
     example = doctest.DocTestParser().get_doctest(text, {"ep": ep, "np": np}, name, None, None)
-    said: list[str] = []
-    doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(example, out=said.append)
-    assert not said, "".join(said)
+    stated: list[str] = []
+    doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(example, out=stated.append)
+    assert not stated, "".join(stated)

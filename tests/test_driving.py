@@ -14,9 +14,9 @@ from ep2sindy.signals.driving import (
     describe_set,
     drop_repeats,
     propose_inputs,
-    say_what_is_not_told,
+    report_unknown_drive,
 )
-from ep2sindy.signals.trace import Trace, prepare_signal
+from ep2sindy.signals.signal import Signal, prepare_signal
 from tests.programs import composed, summary_of
 
 PERIOD_S = 5.3
@@ -24,10 +24,11 @@ TURN = 2.0 * np.pi
 
 
 def moved(
-    rates: Callable[[np.ndarray, float], Sequence[float]], start: Sequence[float], *, share: float,
+    rates: Callable[[np.ndarray, float], Sequence[float]], start: Sequence[float], *,
+    fraction: float,
     n_periods: int = 150, per_period: int = 40, period_s: float = TURN, seed: int = 0,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Times and first state of noisy equations; share: of process noise of every state a period."""
+    """Times and first state of noisy equations; fraction: process noise a period."""
     rng, n_fine = np.random.default_rng(seed), 8
     h = period_s / per_period / n_fine
     x, t, found = np.array(start), 0.0, []
@@ -36,7 +37,7 @@ def moved(
             found.append((t, x[0]))
         half = x + 0.5 * h * np.asarray(rates(x, t))
         x = x + h * np.asarray(rates(half, t + 0.5 * h))
-        x = x + share * np.sqrt(h / period_s) * rng.standard_normal(len(x))
+        x = x + fraction * np.sqrt(h / period_s) * rng.standard_normal(len(x))
         t += h
     times, samples = np.array(found[10 * per_period :]).T
     return times, samples + 0.01 * samples.std() * rng.standard_normal(len(samples))
@@ -50,7 +51,7 @@ def van_der_pol(x: np.ndarray, t: float) -> list[float]:
     return [x[1], (1.0 - x[0] ** 2) * x[1] - x[0]]
 
 
-def sampled(wave: np.ndarray, t: np.ndarray, noise: float = 0.02) -> Trace:
+def sampled(wave: np.ndarray, t: np.ndarray, noise: float = 0.02) -> Signal:
     noisy = wave + noise * wave.std() * np.random.default_rng(1).standard_normal(len(wave))
     return prepare_signal((t, noisy))
 
@@ -68,25 +69,25 @@ def swept(f_Hz: float = 0.1387, n_periods: int = 40) -> tuple[np.ndarray, np.nda
 
 
 def test_a_phase_that_is_pushed_and_returns_is_asked_about() -> None:
-    signal = prepare_signal(moved(forced, [0.0, 0.0], share=0.1, period_s=TURN / 0.9137))
+    signal = prepare_signal(moved(forced, [0.0, 0.0], fraction=0.1, period_s=TURN / 0.9137))
     question = ask_whether_driven(signal, {})
     assert question is not None
-    assert "its phase is pushed by " in question
+    assert "its phase moves by " in question
     assert " rad from period to period, and returns over " in question
     assert "inputs=[COLUMN] if a column is the drive, or period_s=6.8" in question
-    assert say_what_is_not_told(signal) is None
+    assert report_unknown_drive(signal) is None
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_a_phase_that_walks_is_not(seed: int) -> None:
-    t, x = moved(van_der_pol, [2.0, 0.0], share=0.1, period_s=6.66, seed=seed)
+    t, x = moved(van_der_pol, [2.0, 0.0], fraction=0.1, period_s=6.66, seed=seed)
     assert ask_whether_driven(prepare_signal((1.0371 * t, x)), {}) is None
 
 
 def test_a_record_in_which_nothing_moves_tells_neither() -> None:
-    signal = prepare_signal(moved(van_der_pol, [2.0, 0.0], share=0.0, n_periods=40))
+    signal = prepare_signal(moved(van_der_pol, [2.0, 0.0], fraction=0.0, n_periods=40))
     assert ask_whether_driven(signal, {}) is None
-    remark = say_what_is_not_told(signal)
+    remark = report_unknown_drive(signal)
     assert remark is not None
     assert remark.startswith("this record does not tell whether x sustains itself or is driven")
 
@@ -99,7 +100,7 @@ def test_what_falls_between_coarse_samples_is_no_push() -> None:
 
 def test_a_round_frequency_of_a_phase_that_walks_is_not_asked_about() -> None:
     """A walk leaves its frequency unknown to more than the distance of round numbers."""
-    t, x = moved(van_der_pol, [2.0, 0.0], share=0.1, period_s=6.66, seed=3)
+    t, x = moved(van_der_pol, [2.0, 0.0], fraction=0.1, period_s=6.66, seed=3)
     own_Hz = prepare_signal((t, x)).frequency_Hz
     assert ask_whether_driven(prepare_signal((t * own_Hz / 500.0, x)), {}) is None
 
@@ -246,6 +247,6 @@ def test_a_study_asks_whether_a_signal_is_driven_and_takes_the_column(tmp_path: 
     both = "+data.variables={x:{name:x,unit:1},V:{name:V,unit:1}}"
     asked = run_config(composed(*given, "+data.variables={x:{name:x,unit:1}}"))
     assert "is x driven? It may be: V beside it looks set" in (asked / "run.log").read_text()
-    told = run_config(composed(*given, both, "inputs=[V]"))
-    assert "is x driven?" not in (told / "run.log").read_text()
-    assert set(summary_of(told)["models"]["model"]["equations"]["x"]) == {"x", "V", "V^2"}
+    stated = run_config(composed(*given, both, "inputs=[V]"))
+    assert "is x driven?" not in (stated / "run.log").read_text()
+    assert set(summary_of(stated)["models"]["model"]["equations"]["x"]) == {"x", "V", "V^2"}

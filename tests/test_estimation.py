@@ -32,7 +32,7 @@ from ep2sindy.estimation.noise import _shown_by_samples
 from ep2sindy.estimation.observation import LackOfFit, Solution
 from ep2sindy.estimation.problem import EstimationProblem, scale_problem
 from ep2sindy.estimation.solver import EXACT, from_smooth, smooth_states
-from ep2sindy.estimation.supports import alternatives, best_support, penalise, term_prices
+from ep2sindy.estimation.supports import alternatives, best_support, penalise, term_penalties
 from ep2sindy.trust import memory
 from ep2sindy.trust.interruption import is_interruption
 from tests.test_exact_inputs import SWITCH, driven
@@ -255,13 +255,13 @@ def test_the_gram_pair_foretells_what_a_dropped_term_costs() -> None:
 
 def test_block_by_block_finds_the_best_support_of_all() -> None:
     problem, fit = fitted_lorenz(0.1)
-    pair, prices = gram(fit), term_prices(problem, 200.0)
-    full = best_support(problem, pair, prices, np.ones_like(fit.support))
-    empty = best_support(problem, pair, prices, np.zeros_like(fit.support))
+    pair, penalties = gram(fit), term_penalties(problem, 200.0)
+    full = best_support(problem, pair, penalties, np.ones_like(fit.support))
+    empty = best_support(problem, pair, penalties, np.zeros_like(fit.support))
     assert full.score == pytest.approx(empty.score)
-    for j in range(len(prices)):
-        changed = full.support ^ (np.arange(len(prices)) == j)
-        assert penalise(pair, changed, prices).score >= full.score - 1e-6
+    for j in range(len(penalties)):
+        changed = full.support ^ (np.arange(len(penalties)) == j)
+        assert penalise(pair, changed, penalties).score >= full.score - 1e-6
 
 
 def test_alternatives_hold_an_exchange_between_equations_that_neither_wants_alone() -> None:
@@ -274,10 +274,10 @@ def test_alternatives_hold_an_exchange_between_equations_that_neither_wants_alon
     columns[[first, other], other] = np.sqrt([0.99, 0.01])  # nearly the other equation's term
     target = 10.0 * columns[:, other]
     pair = Gram(columns.T @ columns, columns.T @ target, float(target @ target))
-    prices = np.full(n, 3.0)
+    penalties = np.full(n, 3.0)
     chosen, true = np.arange(n) == first, np.arange(n) == other
-    assert np.array_equal(best_support(problem, pair, prices, chosen).support, chosen)
-    found = alternatives(problem, pair, prices, chosen, within=3.0)
+    assert np.array_equal(best_support(problem, pair, penalties, chosen).support, chosen)
+    found = alternatives(problem, pair, penalties, chosen, within=3.0)
     assert np.array_equal(found[0].support, true)
     assert found[0].score == pytest.approx(3.0)
     assert all(each.score <= 4.0 + 3.0 for each in found)
@@ -291,9 +291,9 @@ def test_a_near_miss_of_the_search_is_polished() -> None:
 def test_prices_count_what_a_term_is_told_from() -> None:
     problem, _ = lorenz_problem()
     names = [problem.library.names[c] for c in problem.column[:10]]
-    prices = dict(zip(names, term_prices(problem, 100.0)[:10], strict=True))
-    assert prices["1"] == prices["x"] == pytest.approx(np.log(100.0) + 2 * np.log(12.0))
-    assert prices["x*y"] == pytest.approx(np.log(100.0) + 2 * np.log(30.0) + 2 * np.log(2.0))
+    penalties = dict(zip(names, term_penalties(problem, 100.0)[:10], strict=True))
+    assert penalties["1"] == penalties["x"] == pytest.approx(np.log(100.0) + 2 * np.log(12.0))
+    assert penalties["x*y"] == pytest.approx(np.log(100.0) + 2 * np.log(30.0) + 2 * np.log(2.0))
 
 
 def is_right(model: ep.SparseModel, system: object) -> bool:
@@ -313,7 +313,7 @@ def is_right(model: ep.SparseModel, system: object) -> bool:
 def test_known_equations_are_found_in_noise(system: ep.systems.System, noise: float) -> None:
     found = ep.estimate([system.trajectory(noise=noise, rng=3)], system.model.library)
     assert is_right(found.model, system)
-    assert found.misfit == ""
+    assert found.lack_of_fit == ""
 
 
 def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
@@ -321,7 +321,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
     for seed in range(20):
         run = system.trajectory(noise=0.2, rng=seed)
         found = ep.estimate([run], system.model.library.only(terms_of(system.model)))
-        for state in ("x", "y") if not found.misfit else ():
+        for state in ("x", "y") if not found.lack_of_fit else ():
             true = system.model.terms(state)
             for term, (low, high) in found.model.intervals(state).items():
                 inside.append(low <= true[term] <= high)
@@ -351,7 +351,7 @@ def test_lasting_noise_is_told_from_signal_and_buys_no_terms() -> None:
     system = ep.lorenz()
     found = ep.estimate([lasting(system.trajectory(), 0.05, 0.7, 0)], system.model.library)
     assert is_right(found.model, system)
-    assert found.misfit == ""
+    assert found.lack_of_fit == ""
     np.testing.assert_allclose(found.memory, 0.7, atol=0.06)
 
 
@@ -373,7 +373,7 @@ def test_noise_that_grows_with_the_state_is_weighed_so() -> None:
     run = ep.Trajectory(clean.t, clean.states + noise, clean.state_names)
     found = ep.estimate([run], system.model.library)
     assert is_right(found.model, system)
-    assert found.misfit == ""
+    assert found.lack_of_fit == ""
 
 
 def test_what_fits_comes_before_what_scores_lower(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -387,7 +387,7 @@ def test_what_fits_comes_before_what_scores_lower(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(explanation, "from_smooth", leaves)
     system = ep.lotka_volterra()
     found = ep.estimate([system.trajectory(noise=0.05, rng=0)], system.model.library)
-    assert found.misfit == ""
+    assert found.lack_of_fit == ""
     assert found.flow_error == 0.0
     assert is_right(found.model, system)
 
@@ -395,18 +395,20 @@ def test_what_fits_comes_before_what_scores_lower(monkeypatch: pytest.MonkeyPatc
 def test_a_linear_library_of_what_is_not_linear_is_called_a_misfit() -> None:
     run = ep.lotka_volterra().trajectory(noise=0.05, rng=0).window(0, 300)
     found = ep.estimate([run], ep.named_terms(["x", "y"], ["x", "y"]))
-    assert found.misfit.startswith("this library lacks terms: with products up to degree 2")
-    assert "libraries.model.degree=2" in found.misfit
+    assert found.lack_of_fit.startswith("this library lacks terms: with products up to degree 2")
+    assert "libraries.model.degree=2" in found.lack_of_fit
 
 
 def test_an_equation_with_all_the_terms_that_it_may_have_is_a_misfit() -> None:
     system = ep.lorenz()
     run, library = system.trajectory(noise=0.05, rng=0), system.model.library
     found = ep.estimate([run], library, max_terms=3)
-    assert found.misfit.startswith("y' with as many terms as may be (max_terms=3): they may stand")
+    assert found.lack_of_fit.startswith(
+        "y' with as many terms as may be (max_terms=3): they may stand"
+    )
     assert found.model.covariance is None
     known = {"y": ["x", "y", "x*z"]}
-    assert ep.estimate([run], library.only(known), max_terms=3).misfit == ""
+    assert ep.estimate([run], library.only(known), max_terms=3).lack_of_fit == ""
 
 
 def test_random_times_serve_as_well() -> None:
@@ -496,7 +498,7 @@ def test_the_search_is_the_same_in_other_units() -> None:
     ("settings", "message"),
     [
         ({"selection": ep.EBIC()}, r"selection must be Evidence\(\)"),
-        ({"max_terms": 0}, "max_terms must be a whole number, one or more: 0"),
+        ({"max_terms": 0}, "max_terms must be a whole number, one or more, got 0"),
         ({"limit_s": 0.0}, "limit_s must be positive, in s, or None"),
         ({"limit_s": np.nan}, "limit_s must be positive, in s, or None"),
     ],
@@ -521,7 +523,7 @@ def test_settings_of_a_given_search_hold_and_none_is_given_twice() -> None:
     assert method_with(deep, ep.discovery.Evidence(), 1) == deep
     assert method_with(ep.TrajectorySearch(), RULE, 2) == RULED
     assert method_with(RULED, ep.discovery.Evidence(), 2) == RULED
-    with pytest.raises(ValueError, match=r"must be set once: .*search.depth\), and 2 beside"):
+    with pytest.raises(ValueError, match=r"must be set once, got .*search.depth\), and 2 beside"):
         method_with(deep, ep.discovery.Evidence(), 2)
     with pytest.raises(ValueError, match="search.selection.*; leave one of them out"):
         method_with(RULED, ep.FreeRunScore(n_folds=3), 1)
@@ -553,7 +555,7 @@ def test_a_library_without_the_constant_where_a_state_drifts_is_a_misfit() -> No
     states = np.column_stack([0.5 * t, np.cos(t)]) + 0.05 * rng.standard_normal((100, 2))
     library = ep.named_terms(["x", "y"], ["y", "x*y", "y^2"])
     found = ep.estimate([ep.Trajectory(t, states, ["x", "y"])], library)
-    assert "no law of this library explains y: a term or a state is missing" in found.misfit
+    assert "no law of this library explains y: a term or a state is missing" in found.lack_of_fit
 
 
 def many_states(n_states: int) -> ep.Trajectory:
@@ -639,8 +641,8 @@ def test_more_coefficients_than_memory_holds_are_refused_first(
     run = many_states(10)
     library = ep.polynomial(run.state_names, degree=3)
     monkeypatch.setattr(cost, "NUMBERS", 50.0)
-    said = r"2860 coefficients \(286 terms, 10 states\), of which 200 .* 400 samples, would take"
-    with pytest.raises(ValueError, match=said):
+    stated = r"2860 coefficients \(286 terms, 10 states\), of which 200 .* 400 samples, would take"
+    with pytest.raises(ValueError, match=stated):
         ep.estimate([run], library)
     run_of_known_terms = {name: ["x0", "x1"] for name in run.state_names}
     cost.check_size([run], library, run_of_known_terms)
@@ -650,11 +652,11 @@ def test_a_long_search_is_told_of_with_its_time() -> None:
     run, t = many_states(7), np.linspace(0.0, 900.0, 90_000)
     long = ep.Trajectory(t, np.tile(np.sin(t)[:, None], 7), run.state_names)
     large = ep.polynomial(run.state_names, degree=3)
-    said = r"840 coefficients .*, of which 140 .* some 2 minutes of one core and 2.6 GB"
-    with pytest.warns(ep.discovery.SlowSearch, match=said):
+    stated = r"840 coefficients .*, of which 140 .* some 2 minutes of one core and 2.6 GB"
+    with pytest.warns(ep.discovery.SlowSearch, match=stated):
         cost.check_size([long], large, {})
     with pytest.warns(ep.discovery.SlowSearch, match="of which 840 .* some 60 minutes"):
-        cost.check_size([long], large, {}, tied=True)
+        cost.check_size([long], large, {}, coupled=True)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         cost.check_size([run], large, {})
@@ -678,19 +680,19 @@ class Clock:
 def test_a_search_ends_at_its_limit_with_the_best_so_far(
     monkeypatch: pytest.MonkeyPatch, limit_s: float
 ) -> None:
-    """However early: the model is whole, and what is said of it says that the search was ended."""
+    """However early: the model is whole, and what holds for it says that the search was ended."""
     run = ep.lorenz().trajectory(noise=0.05, rng=0)
     monkeypatch.setattr(cost, "time", Clock())
     found = ep.estimate(run, ep.polynomial(["x", "y", "z"], degree=3), limit_s=limit_s)
     assert np.isfinite(found.model.coef).all()
     assert found.model.coef.any()
     assert all(path.shape == run.states.shape for path in found.paths)
-    ended = found.misfit.startswith("the search was ended by limit_s after")
+    ended = found.lack_of_fit.startswith("the search was ended by limit_s after")
     if limit_s < 1000.0:
         assert ended
         assert found.model.covariance is None
     else:
-        assert not found.misfit
+        assert not found.lack_of_fit
         assert set(found.model.terms("x")) == {"x", "y"}
 
 
@@ -749,7 +751,7 @@ def test_what_is_found_in_a_part_of_a_record_says_so(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(cost, "PARTS", (run.n_samples // 3,))
     monkeypatch.setattr(cost, "free_bytes", lambda: 0)  # for a larger part
     found = ep.estimate(run, library, limit_s=1e6)
-    assert not found.misfit
+    assert not found.lack_of_fit
     assert set(found.model.terms("x")) == {"x", "x*y"}
     n_taken = sum(each.n_samples for each in found.runs)
     assert n_taken <= run.n_samples // 3
@@ -773,7 +775,7 @@ def test_an_interruption_ends_a_search_that_is_watched() -> None:
         return advance
 
     found = ep.estimate(run, library, progress=interrupt(15))
-    assert "ended by an interruption after" in found.misfit + " ".join(found.remarks)
+    assert "ended by an interruption after" in found.lack_of_fit + " ".join(found.remarks)
     assert found.model.coef.any()
     steps = 0
     with pytest.raises(KeyboardInterrupt):
@@ -809,7 +811,7 @@ def test_a_path_that_misses_the_steps_of_its_model_is_no_trajectory() -> None:
     missing[:, 2] = np.arange(300) % 10 > 0
     found = ep.estimate(replace(run, missing=missing), LORENZ.model.library)
     assert found.flow_error > EXACT
-    assert "the states leave the model" in found.misfit
+    assert "the states leave the model" in found.lack_of_fit
     assert found.model.covariance is None
 
 
@@ -825,7 +827,7 @@ def test_right_models_meet_their_steps() -> None:
 @pytest.mark.slow
 def test_process_noise_alone_is_no_law() -> None:
     found = ep.estimate(SHORT["60 samples, 20 %"](3), LORENZ.model.library)
-    assert found.misfit or found.model.coef.any(axis=0).all()
+    assert found.lack_of_fit or found.model.coef.any(axis=0).all()
 
 
 def test_samples_that_leave_the_terms_open_are_said_to_tell_nothing() -> None:

@@ -182,7 +182,7 @@ def test_the_title_of_a_result_says_where_a_model_was_fitted_and_what_it_does_no
     )
     similar = replace(run, status=Status.NO_CYCLE)
     assert title(similar) == "Found: a model that has the means and amplitudes of the data"
-    assert title(similar, misfit="no law") == "Found: a model that does not explain the data"
+    assert title(similar, lack_of_fit="no law") == "Found: a model that does not explain the data"
 
 
 def test_of_several_records_the_worst_run_counts() -> None:
@@ -197,7 +197,7 @@ def test_a_neutral_cycle_is_told_and_every_start_has_its_own() -> None:
     assert found.cycle is not None
     assert (found.status, found.cycle.stability) == (Status.SUSTAINED, "neutral")
     assert found.multiplier == pytest.approx(1.0, abs=1e-6)
-    assert found.share_reaching < 0.2
+    assert found.basin_stability < 0.2
     assert "neither attracts nor repels" in found.caution
     assert found.rest is not None
     np.testing.assert_allclose(found.rest.state, [1 / 3, 2 / 3], rtol=1e-9)
@@ -208,7 +208,7 @@ def test_a_neutral_cycle_is_told_and_every_start_has_its_own() -> None:
 def test_an_attracting_cycle_has_its_multiplier_and_rests_inside() -> None:
     found = evaluate(hopf(growth=0.05), record())
     assert found.multiplier == pytest.approx(np.exp(-0.2 * np.pi), rel=1e-6)
-    assert found.share_reaching == 1.0
+    assert found.basin_stability == 1.0
     assert not found.caution
     (rest,) = found.rest_points
     np.testing.assert_array_equal(rest.state, [0.0, 0.0])
@@ -228,7 +228,7 @@ def test_rest_points_are_those_near_the_record() -> None:
 def test_a_run_without_a_cycle_has_none_of_its_numbers() -> None:
     decays, diverges = (evaluate(hopf(growth=g, radius=1e9), record()) for g in (-0.2, 0.3))
     for found in (decays, diverges):
-        numbers = (found.multiplier, found.share_reaching)
+        numbers = (found.multiplier, found.basin_stability)
         assert np.isnan(numbers).all()
         assert (found.cycle, found.rest, found.cycle_text, found.caution) == (None, None, "", "")
         assert [rest.growth_per_s > 0.0 for rest in found.rest_points] == [found is diverges]
@@ -238,15 +238,15 @@ def test_a_run_without_a_cycle_has_none_of_its_numbers() -> None:
 
 def test_only_what_is_asked_for_is_computed_and_once(monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[str] = []
-    for name in ("limit_cycle", "share_reaching", "rest_point", "forecast_skill"):
+    for name in ("limit_cycle", "basin_stability", "rest_point", "forecast_skill"):
         plain = getattr(evaluation, name)
 
-        def told(*args: Any, name: str = name, plain: Any = plain, **kwargs: Any) -> Any:
+        def stated(*args: Any, name: str = name, plain: Any = plain, **kwargs: Any) -> Any:
             calls.append(name)
             skill = SimpleNamespace(text=f"fitted to {kwargs.get('n_fitted')}")
             return skill if name == "forecast_skill" else plain(*args, **kwargs)
 
-        monkeypatch.setattr(evaluation, name, told)
+        monkeypatch.setattr(evaluation, name, stated)
     found = evaluate(hopf(growth=0.05), record(), n_fitted=1000)
     assert (found.status, found.record.n_samples) == (Status.SUSTAINED, 1002)
     assert found.periods == pytest.approx(20.0, abs=0.1)
@@ -264,7 +264,7 @@ def test_of_a_line_of_rest_points_one_is_told() -> None:
     run = record()
     beside = evaluate(model_of({"x": {"y": 1.0}, "y": {"y": -1.0}}), run, n_samples=200)
     (line,) = beside.rest_texts
-    assert "neutral: a departure neither grows nor decays" in line
+    assert "neutral: a perturbation neither grows nor decays" in line
     far = evaluate(model_of({"x": {"1": 1e3, "x": -1.0}, "y": {"y": -1.0}}), run, n_samples=200)
     assert far.rest_points == ()
 
@@ -280,7 +280,7 @@ def test_forecasts_need_held_out_samples() -> None:
 
 
 def test_the_table_fits_a_screen_and_tells_what_a_discovery_does_not_explain() -> None:
-    found = evaluate(SimpleNamespace(model=hopf(), misfit="x < its noise"), record())
+    found = evaluate(SimpleNamespace(model=hopf(), lack_of_fit="x < its noise"), record())
     assert found.lack_of_fit == "x < its noise"
     lines = repr(found).splitlines()
     assert lines[1].split() == ["status", "sustained"]

@@ -8,7 +8,7 @@ import pytest
 
 import ep2sindy as ep
 from ep2sindy.discovery.discover import discover
-from ep2sindy.estimation.hidden import entrances
+from ep2sindy.estimation.hidden import couplings
 from tests import programs
 
 RUN = ep.lotka_volterra().trajectory(noise=0.01, rng=0).window(0, 250)
@@ -45,9 +45,9 @@ def test_what_is_left_is_found_as_from_a_library_without_the_term(
 
 def test_a_hidden_state_enters_by_no_excluded_term() -> None:
     library = ep.polynomial(["x", "y", "z"], degree=2)
-    ways = {(way.state, way.term) for (way,) in entrances(library, ["x", "y"], ["z"])}
+    ways = {(way.state, way.term) for (way,) in couplings(library, ["x", "y"], ["z"])}
     known = library.exclude({"x": ["z"]})
-    left = {(w.state, w.term) for (w,) in entrances(known, ["x", "y"], ["z"])}
+    left = {(w.state, w.term) for (w,) in couplings(known, ["x", "y"], ["z"])}
     assert ways - left == {("x", "z")}
 
 
@@ -125,5 +125,5 @@ def test_a_config_excludes_terms(tmp_path) -> None:
     assert terms == {"x", "y", "x y", "y^2"}
     with pytest.raises(ValueError, match="exclude.x must be a list: got 'x'"):
         programs.computed(programs.composed(*given, "exclude={x: x}"))
-    with pytest.raises(ValueError, match="exclude goes without living, .* take .exp=discover"):
+    with pytest.raises(ValueError, match="exclude goes with sustained=none, .* take .exp=discover"):
         programs.computed(programs.composed("+exp=breathing", "+exclude={n_i: [n_i]}"))

@@ -161,15 +161,15 @@ def test_refinements_return_predator_and_prey(predator_prey: Path, tmp_path: Pat
 def test_every_iteration_is_told_one_scalar_each() -> None:
     library = polynomial(["x", "y"], degree=2)
     held = constraint(library, {"x": ["x", "x*y"], "y": ["y", "x*y"]}, ["x: x*y == -1 * y: x*y"])
-    told: list[tuple[int, dict[str, float]]] = []
-    watch = watcher(lambda scalars, *, step: told.append((step, scalars)), "ils", held)
+    stated: list[tuple[int, dict[str, float]]] = []
+    watch = watcher(lambda scalars, *, step: stated.append((step, scalars)), "ils", held)
     for loss in (0.5, 0.25):
         watch(Iteration(0, 25, loss, np.array([1.0, 2.0, 3.0]), 0.1, 1e-9))
-    assert [step for step, _ in told] == [0, 1, 2]
+    assert [step for step, _ in stated] == [0, 1, 2]
     fit = {"ils/loss": 0.25, "ils/step": 0.1, "ils/defect": 1e-9, "ils/window_stage": 25}
     scalings = {"ils/scaling/x/x": 1.0, "ils/scaling/x/x.y": 2.0, "ils/scaling/y/y": 3.0}
-    assert told[2][1] == fit | scalings
-    assert told[0][1] == dict.fromkeys(scalings, 1.0)
+    assert stated[2][1] == fit | scalings
+    assert stated[0][1] == dict.fromkeys(scalings, 1.0)
 
 
 def test_weak_forms_find_predator_and_prey(predator_prey: Path, tmp_path: Path) -> None:
@@ -255,7 +255,7 @@ def test_the_balance_gives_every_process_its_coefficients() -> None:
     ("outflow", "inflow", "is_net"),
     [
         ({"n_i": ["n_i"], "n_n": ["n_i*n_n"]}, ["n_n"], False),  # what leaves stands apart
-        ({"n_i": ["n_i"]}, 2e23, False),  # what enters was told
+        ({"n_i": ["n_i"]}, 2e23, False),  # what enters was stated
         ({"n_i": ["n_i"]}, ["n_n"], True),
     ],
 )

@@ -20,7 +20,7 @@ from ep2sindy.studies.libraries import Study
 from tests.models import model_of
 from tests.programs import ROOT, Computed, composed, computed, on_file, summary_of
 
-NO_LIVING = ("living=none", "held_out=null", "forecasts=0")
+NO_LIVING = ("sustained=none", "held_out=null", "forecasts=0")
 
 
 def breathing(path: Path, output: Path) -> list[str]:
@@ -29,18 +29,18 @@ def breathing(path: Path, output: Path) -> list[str]:
         "+exp=breathing",
         *on_file(path, output, "R_ion", "u_iz"),
         "bootstraps.n=4",
-        "living=free",  # predator and prey conserve nothing
-        "living.search.max_terms=2",  # as many as the truth has
-        "+living.selection.n_windows=6",
-        "+living.selection.n_folds=2",
+        "sustained=free",  # predator and prey conserve nothing
+        "sustained.search.max_terms=2",  # as many as the truth has
+        "+sustained.selection.n_windows=6",
+        "+sustained.selection.n_folds=2",
         "rollout_s=1.0e-3",
         "forecasts=2",
     ]
 
 
 def plain(path: Path, output: Path) -> list[str]:
-    """The same without a model that lives."""
-    kept = [text for text in breathing(path, output) if "living" not in text]
+    """The same without a self-sustained model."""
+    kept = [text for text in breathing(path, output) if "sustained" not in text]
     return [*kept, *NO_LIVING]
 
 
@@ -87,11 +87,11 @@ def test_breathing_ends_in_a_model_that_lives(breathing_run: Path) -> None:
     assert run["f_error"] == pytest.approx(0.0, abs=1e-4)
     assert run["waveform_error"] == pytest.approx({"n_i": 0.0, "n_n": 0.0}, abs=1e-2)
     assert run["amplitude_ratio"] == pytest.approx({"n_i": 1.0, "n_n": 1.0}, abs=1e-2)
-    assert set(found["living"]) == {"simple_living"}  # the others have inputs
-    living = found["living"]["simple_living"]
-    assert living["n_terms"] == 4
-    assert living["stability"] == "neutral"  # predator and prey
-    assert living["multiplier"] == pytest.approx(1.0, abs=1e-3)
+    assert set(found["sustained"]) == {"simple_living"}  # the others have inputs
+    sustained = found["sustained"]["simple_living"]
+    assert sustained["n_terms"] == 4
+    assert sustained["stability"] == "neutral"  # predator and prey
+    assert sustained["multiplier"] == pytest.approx(1.0, abs=1e-3)
     ions = model["equations"]["n_i"]["n_i"]
     assert ions == pytest.approx(-1.64e5, rel=1e-4)
     low, high = model["intervals"]["n_i"]["n_i"]  # the spread over windows: the model may be wrong
@@ -102,7 +102,7 @@ def test_breathing_ends_in_a_model_that_lives(breathing_run: Path) -> None:
     assert "balance_simple" not in found
     for figure in ("free_run_simple", "cycle_simple", "waveform_simple"):
         assert (breathing_run / "figures" / f"{figure}.png").is_file()
-    for table in ("living", "coefficients", "terms_simple", "rollout_simple_living"):
+    for table in ("sustained", "coefficients", "terms_simple", "rollout_simple_living"):
         assert (breathing_run / "tables" / f"{table}.csv").is_file()
 
 
@@ -202,9 +202,13 @@ def test_a_joint_search_says_what_the_samples_say(years: Computed) -> None:
     # Of 91 samples, some of which the parameters take: 10 % is a standard error and a half.
     noise = [found["noise_std"][name] / data[f"{name}_data"].std() for name in ("hare", "lynx")]
     assert noise == pytest.approx([0.02, 0.02], rel=0.25)
-    assert (found["flow_error"], found["misfit"], found["too_few_samples"]) == (0.0, None, None)
-    said = " ".join(years.log.split())
-    assert "The model explains the samples as far as their noise" in said
+    assert (found["flow_error"], found["lack_of_fit"], found["too_few_samples"]) == (
+        0.0,
+        None,
+        None,
+    )
+    stated = " ".join(years.log.split())
+    assert "The model explains the samples as far as their noise" in stated
     assert "95 % from" in years.page
 
 
@@ -321,7 +325,7 @@ def test_a_state_that_shows_nothing_but_noise_has_no_law(tmp_path: Path) -> None
             "data.units={time: s}", "trajectory.states=[x]", f"output={tmp_path}",
         )
     )  # fmt: skip
-    said = " ".join(found.log.split())
-    assert "Found with the library model: no law of any state" in said
-    assert "no law of x is found: about a steady course the samples pass for white noise" in said
-    assert "run freely from one sample over the record" not in said
+    stated = " ".join(found.log.split())
+    assert "Found with the library model: no law of any state" in stated
+    assert "no law of x is found: about a steady course the samples pass for white noise" in stated
+    assert "run freely from one sample over the record" not in stated

@@ -89,8 +89,8 @@ def test_the_headline_is_the_fit_that_errs_least_at_points_left_out(folder: Path
     assert list(errors) == FITS
     best = min(errors, key=lambda fit: errors[fit])
     assert summary["best_fit"] == best
-    said = " ".join(log.split())
-    assert f"over 5 operating points that oscillate, by the fit {best}" in said
+    stated = " ".join(log.split())
+    assert f"over 5 operating points that oscillate, by the fit {best}" in stated
     assert summary["headline"]["window_error"] == errors[summary["law"]["fit"]]
 
 
@@ -206,8 +206,8 @@ def test_own_files_and_points_that_do_not_oscillate(tmp_path: Path) -> None:
     (warning,) = [text for text in found.warnings if "no law of whole models" in text]
     assert "2 points that oscillate get no law" in warning
     assert {row["n_points"] for row in summary["trends"] if row["along"] == "V_D_V"} == {2}
-    said = " ".join(found.log.split())
-    assert "None: a law needs 3 points, and all parameters to vary over them" in said
+    stated = " ".join(found.log.split())
+    assert "None: a law needs 3 points, and all parameters to vary over them" in stated
 
 
 def test_nothing_that_oscillates_is_a_result(tmp_path: Path) -> None:

@@ -66,7 +66,7 @@ def test_the_run_leaves_a_law_tables_figures_and_a_summary(folder: Path) -> None
     assert len(tables["left_out"]) == 4
     assert len(tables["map"]) == 4
     assert {p.stem for p in (folder / "figures").glob("*.png")} >= {"left_out", "laws"}
-    assert headline["n_lives"] == (tables["left_out"]["status"] == "sustained").sum()
+    assert headline["n_sustained"] == (tables["left_out"]["status"] == "sustained").sum()
     assert headline["window_error"] == pytest.approx(chosen["error"])
     points = tables["points"]
     right = (points["status"] == "oscillating") == (points["law"] == "sustained")
@@ -153,7 +153,9 @@ def test_own_records_make_a_law_of_the_model_that_is_chosen_and_its_line(tmp_pat
     assert set(found.report.figures) == {"laws", "left_out", "map"}
     found.check_figures(*found.report.figures)
     log = " ".join(found.log.split())
-    assert re.search("Found: a law of held.* over a, by which 3 of 3 points left out live", log)
+    assert re.search(
+        "Found: a law of held.* over a, by which 3 of 3 points left out are sustained", log
+    )
     assert re.search(r"\d mHz", log)
 
 
@@ -192,9 +194,9 @@ def test_of_two_cycles_the_law_is_that_of_the_one_with_most_records(tmp_path: Pa
         (0.1 * table).to_csv(tmp_path / f"{a}.csv")
     found = programs.computed(composed(*settings))
     assert found.summary["law"]["cycle"] == "strong"
-    (said,) = [each for each in found.warnings if "two cycles coexist" in each]
-    assert "the law is that of the 5 points on the strong one" in said
-    assert said.endswith("on the other are a=0.7, a=0.8")
+    (stated,) = [each for each in found.warnings if "two cycles coexist" in each]
+    assert "the law is that of the 5 points on the strong one" in stated
+    assert stated.endswith("on the other are a=0.7, a=0.8")
     points = found.report.tables["points"].set_index("a")["branch"]
     assert points.to_dict() == {a: "weak" if a in values[2:4] else "strong" for a in values}
     law = OperatingLaw.load(found.folder / "law.json")

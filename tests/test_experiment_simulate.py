@@ -271,7 +271,7 @@ def test_a_record_that_broke_late_can_be_studied() -> None:
 
 
 def test_a_steady_simulation_warns_on_the_page_of_the_study_that_takes_it(tmp_path: Path) -> None:
-    """150 V: the discharge is steady, and its start has died out after a few tenths of a ms."""
+    """150 V: the discharge is steady, and its start has decayed after a few tenths of a ms."""
     found = programs.computed(
         programs.composed(
             "+exp=weak",

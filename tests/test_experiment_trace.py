@@ -37,7 +37,7 @@ def toy(path: Path, output: Path, *more: str) -> list[str]:
 
 
 def glance(path: Path, output: Path, *more: str) -> list[str]:
-    """What is said of a smoothed signal; the model, of one term, is chosen without a free run."""
+    """The description of a smoothed signal; the model of one term has no free run."""
     few = ("depth=1", "search.n_best=1", "search.max_terms=1", "selection=ebic")
     given = [o for o in toy(path, output, *few) if not o.startswith("selection.")]
     return [*given, "tried=[{how: rate}]", *more]
@@ -54,7 +54,7 @@ def test_hidden_states_that_are_a_misfit_are_shown_if_they_are_asked_for(tmp_pat
     found = computed(composed(*glance(path, tmp_path, "tried=[{how: hidden, degree: 1}]")))
     assert found.summary["signal"]["how"] == "hidden"
     assert found.summary["signal"]["reason"] == "set"
-    assert found.summary["signal"]["misfit"]
+    assert found.summary["signal"]["lack_of_fit"]
     assert not found.summary["models"]["trace"]["intervals"]
 
 
@@ -74,13 +74,13 @@ def test_one_column_of_a_file_becomes_a_model_that_lives(record: Path, tmp_path:
     log = (folder / "run.log").read_text()
     assert "known: I' = I g" in " ".join(log.split())
     assert "intervals are not given" in " ".join(log.split())  # of smoothed states
-    assert summary["signal"]["misfit"]
+    assert summary["signal"]["lack_of_fit"]
     forecast = summary["forecasts"]["trace"]
     assert {"model", "harmonics", "autoregression", "neighbours"} <= set(forecast["nrmse"])
     assert "Found from I: a model that forecasts within half a standard deviation" in log
     assert f"and more, {forecast['text']}" in " ".join(log.split())
     assert "run freely from one sample over its end" in log
-    assert "unstable: a departure grows" in " ".join(log.split())
+    assert "unstable: a perturbation grows" in " ".join(log.split())
     assert max(forecast["nrmse"]["model"]) < 0.3
     (tried,) = summary["tried"]
     assert tried["n_states"] == 2
@@ -198,7 +198,7 @@ def test_one_column_of_a_file_becomes_the_law_with_intervals(record: Path, tmp_p
     found = trace.summary
     assert found["signal"]["how"] == "hidden"
     model = found["models"]["trace"]
-    assert not found["signal"]["misfit"]
+    assert not found["signal"]["lack_of_fit"]
     assert model["equations"]["I"] == pytest.approx({"I*g": 1.0})
     assert model["equations"]["g"] == pytest.approx(CYCLE, rel=0.02)
     for term, (low, high) in model["intervals"]["g"].items():

@@ -69,7 +69,7 @@ def test_editors_and_type_checkers_see_the_names(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("room", "name", "said"),
+    ("room", "name", "stated"),
     [
         (
             "ep2sindy",
@@ -80,8 +80,8 @@ def test_editors_and_type_checkers_see_the_names(tmp_path: Path) -> None:
         ("ep2sindy", "_nothing", r"no attribute '_nothing'; see dir\(ep2sindy\)$"),
     ],
 )
-def test_an_unknown_name_says_where_to_look(room: str, name: str, said: str) -> None:
-    with pytest.raises(AttributeError, match=said):
+def test_an_unknown_name_says_where_to_look(room: str, name: str, stated: str) -> None:
+    with pytest.raises(AttributeError, match=stated):
         getattr(import_module(room), name)
 
 

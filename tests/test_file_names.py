@@ -150,16 +150,18 @@ def test_files_make_a_law_over_the_quantity_of_their_names(here: Path) -> None:
     law = OperatingLaw.load(found.folder / "law.json")
     assert law.at(a=1.0).terms("n_i")["n_i"] == pytest.approx(1.0, abs=1e-3)
     assert "left out, for their names hold no number there: aold.csv" in found.log
-    assert not [text for text in found.warnings if "lives by the law" in text]
-    said = "models hold known coefficients, models.own.known={'n_n': {'n_i': {'1': 1.0}}}, which as"
-    assert said in " ".join(found.log.split())
+    assert not [text for text in found.warnings if "is sustained by the law" in text]
+    stated = (
+        "models hold known coefficients, models.own.known={'n_n': {'n_i': {'1': 1.0}}}, which as"
+    )
+    assert stated in " ".join(found.log.split())
 
 
 def test_a_law_of_which_no_point_lives_says_what_to_try(here: Path) -> None:
     swing(here, 0.6, 0.9, 1.2)
     found = predicted(here, "{n_i: [n_i,'n_i^3'], n_n: [n_i]}")
-    (advice,) = [text for text in found.warnings if "lives by the law" in text]
-    assert "none of 3 points left out lives" in advice
+    (advice,) = [text for text in found.warnings if "is sustained by the law" in text]
+    assert "none of 3 points left out is sustained" in advice
     assert "try points that lie closer together, other models, or models=null" in advice
 
 
@@ -168,17 +170,17 @@ def test_an_inspection_of_a_glob_writes_the_list_and_the_command(
 ) -> None:
     swing(here, 0.6, 0.9, 1.2)
     assert not ended("inspect", "a*.csv")
-    said = capsys.readouterr().out
-    assert "3 operating points, if the numbers in the names are such:\n" in said
-    assert "{mdot_mg_s} for a flow in mg/s" in said
-    assert "  a=0.6: a0.6.csv\n  a=0.9: a0.9.csv\n  a=1.2: a1.2.csv\n" in said
-    assert "ep2sindy +exp=predict data=recognised 'points.files=a{a}.csv'" in said
+    stated = capsys.readouterr().out
+    assert "3 operating points, if the numbers in the names are such:\n" in stated
+    assert "{mdot_mg_s} for a flow in mg/s" in stated
+    assert "  a=0.6: a0.6.csv\n  a=0.9: a0.9.csv\n  a=1.2: a1.2.csv\n" in stated
+    assert "ep2sindy +exp=predict data=recognised 'points.files=a{a}.csv'" in stated
     assert not ended("inspect", "a*.csv", "--write", "mine")
     assert "ep2sindy +exp=predict data=mine 'points.files=a{a}.csv'" in capsys.readouterr().out
     config = composed("+exp=predict", "data=recognised", mend("points.files=a{a}.csv"))
     with pytest.raises(ValueError, match="models.inflow cannot hold"):  # its inflow has mdot_mg_s
         study_of(Study, config)
-    (line,) = re.findall(r"ep2sindy (\+exp=.*)", said)  # and no experiment on all as one system
+    (line,) = re.findall(r"ep2sindy (\+exp=.*)", stated)  # and no experiment on all as one system
     study = study_of(Study, composed(*map(mend, shlex.split(line))))
     assert list(study.models) == ["free"]
 

@@ -89,7 +89,7 @@ def test_a_model_that_could_follow_any_samples_is_a_misfit() -> None:
 
 
 # The first is a long curved way off, where ten straight steps end far from the minimum. The second
-# is a wrong optimum of seventeen terms, which only states that are let go again show to be one.
+# is a wrong optimum of seventeen terms, which only states that are relaxed again show to be one.
 @pytest.mark.slow
 @pytest.mark.parametrize("draw", [("AtmosphericRegime", 0.2, 1), ("HyperRossler", 0.01, 1)])
 def test_supports_that_exchanges_between_exact_flows_do_not_reach(
@@ -99,7 +99,7 @@ def test_supports_that_exchanges_between_exact_flows_do_not_reach(
     system, runs = collected_draw(*draw)
     found = ep.estimate(runs, system.model.library)
     assert np.array_equal(found.model.coef != 0.0, system.model.coef != 0.0)
-    assert not found.misfit
+    assert not found.lack_of_fit
 
 
 def test_the_flow_is_compiled_once_for_search_and_refinement() -> None:

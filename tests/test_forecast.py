@@ -22,24 +22,24 @@ DRIVEN = model_of({"x": {"v": 1.0}, "v": {"x": -1.0, "v": -0.3, "u": 1.0}}, ["u"
 
 
 @cache
-def spring(noise: float, *, push: float = 0.0, n: int = 1200, seed: int = 0) -> Trajectory:
+def spring(noise: float, *, momentum_gain: float = 0.0, n: int = 1200, seed: int = 0) -> Trajectory:
     """The exact spring, at steps of 0.1 s, whose speed is pushed at random at every step."""
     rng, h = np.random.default_rng(seed), 0.1
     turn = np.array([[np.cos(h), np.sin(h)], [-np.sin(h), np.cos(h)]])
     states = [np.array([1.0, 0.0])]
     for _ in range(n - 1):
-        states.append(turn @ states[-1] + [0.0, push * rng.standard_normal()])
+        states.append(turn @ states[-1] + [0.0, momentum_gain * rng.standard_normal()])
     samples = np.array(states) + noise * rng.standard_normal((n, 2))
     return Trajectory(h * np.arange(n), samples, ("x", "v"))
 
 
-@pytest.mark.parametrize(("noise", "push"), [(0.1, 0.0), (0.05, 0.02)])
-def test_noise_and_pushes_are_those_of_the_record(noise, push) -> None:
-    estimator = tune_estimator(SPRING, spring(noise, push=push, n=3000))
+@pytest.mark.parametrize(("noise", "momentum_gain"), [(0.1, 0.0), (0.05, 0.02)])
+def test_noise_and_pushes_are_those_of_the_record(noise, momentum_gain) -> None:
+    estimator = tune_estimator(SPRING, spring(noise, momentum_gain=momentum_gain, n=3000))
     # The standard error of either is a hundredth or two of it.
     assert estimator.noise.samples == pytest.approx([noise, noise], rel=0.1)
-    if push:
-        assert estimator.noise.process[1] == pytest.approx(push, rel=0.15)
+    if momentum_gain:
+        assert estimator.noise.process[1] == pytest.approx(momentum_gain, rel=0.15)
     else:
         assert estimator.noise.process.max() < 0.1 * noise
 
@@ -91,12 +91,12 @@ def test_bands_hold_what_they_say(system, noise) -> None:
 
 
 def test_bands_grow_where_the_record_is_pushed() -> None:
-    run = spring(0.02, push=0.05)
+    run = spring(0.02, momentum_gain=0.05)
     low, high = ep.forecast(SPRING, run, 30.0).band()
     width = (high - low)[:, 0]
     assert width[-20:].mean() > 3.0 * width[:5].mean()
     # Pushes that make the second record grow throughout, by chance, cost it its band.
-    runs = (spring(0.02, push=0.05, seed=seed) for seed in (0, 2, 3))
+    runs = (spring(0.02, momentum_gain=0.05, seed=seed) for seed in (0, 2, 3))
     held = [
         ep.model.forecast_skill(SPRING, run, n_fitted=900, starts=30).coverage_90 for run in runs
     ]
@@ -104,7 +104,7 @@ def test_bands_grow_where_the_record_is_pushed() -> None:
 
 
 def driven_spring(n: int = 1200) -> Trajectory:
-    """A damped spring that is pushed by an input which nobody could foresee."""
+    """A damped spring under random perturbations by an input which nobody could foresee."""
     rng, t = np.random.default_rng(3), 0.1 * np.arange(n)
     u = np.repeat(rng.standard_normal(n // 20), 20)
     run = DRIVEN.simulate(t, [1.0, 0.0], inputs={"u": u})
@@ -142,7 +142,7 @@ def test_bands_are_as_wide_as_forecasts_of_the_past_were_off() -> None:
 
 
 def test_widths_are_the_same_however_often_and_in_what_unit_they_are_asked_for() -> None:
-    run = spring(0.05, push=0.02).window(0, 400)
+    run = spring(0.05, momentum_gain=0.02).window(0, 400)
     once, again = (calibrate(tune_estimator(SPRING, run), run).widths for _ in range(2))
     np.testing.assert_array_equal(once.widths, again.widths)
     scaled = replace(run, states=1e-3 * run.states)

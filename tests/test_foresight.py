@@ -5,8 +5,8 @@ import pytest
 
 import ep2sindy as ep
 from ep2sindy.discovery.foresight import is_linear
-from ep2sindy.discovery.one_signal import Preparation, ToldFacts, try_in_turn
-from ep2sindy.signals.trace import Trace, prepare_signal
+from ep2sindy.discovery.one_signal import Preparation, StatedFacts, try_in_turn
+from ep2sindy.signals.signal import Signal, prepare_signal
 
 QUICK = ep.Regression(
     search=ep.BestSubset(max_terms=2, n_best=2),
@@ -15,7 +15,7 @@ QUICK = ep.Regression(
 )
 
 
-def trace_of(x: np.ndarray, step_s: float = 1.0) -> Trace:
+def trace_of(x: np.ndarray, step_s: float = 1.0) -> Signal:
     return prepare_signal(ep.Trajectory(step_s * np.arange(len(x)), x[:, None], ("x",)))
 
 
@@ -61,28 +61,28 @@ def test_a_positive_signal_that_is_linear_has_a_derivative_and_no_rate() -> None
 
 def test_what_is_told_holds_in_the_library_of_every_preparation_that_has_it() -> None:
     states = ep.embed(trace_of(np.sin(np.arange(600) / 6.0)), "derivative")
-    told = ToldFacts(
+    stated = StatedFacts(
         exclude={"v": ["x^2", "x^5"], "g": ["x"]},
         relations=["v: x == -1 * v: v", "g: x == 1"],
         rests_at_zero=True,
     )
-    library = told.add_to(states.library(2, ["cos(x)", "sin(x)"]), states)
+    library = stated.add_to(states.library(2, ["cos(x)", "sin(x)"]), states)
     assert set(library.facts.excluded["v"]) == {"x^2", "1", "cos(x)"}
     assert set(library.facts.excluded) == {"v"}
     assert len(library.facts.relations) == len(states.relations) + 1
 
 
 @pytest.mark.parametrize(
-    ("told", "how", "words"),
+    ("stated", "how", "words"),
     [
-        (ToldFacts(exclude={"y": ["x"]}), "auto", "must name states that are tried"),
-        (ToldFacts(rests_at_zero=True), "hidden", "leave it out"),
+        (StatedFacts(exclude={"y": ["x"]}), "auto", "must name states that are tried"),
+        (StatedFacts(rests_at_zero=True), "hidden", "leave it out"),
     ],
 )
 def test_facts_that_no_preparation_can_keep_are_refused(
-    told: ToldFacts, how: str, words: str
+    stated: StatedFacts, how: str, words: str
 ) -> None:
     signal = trace_of(np.sin(np.arange(600) / 6.0))
     with pytest.raises(ValueError, match=words):
-        told.check([Preparation(how)], signal)
-    ToldFacts(exclude={"v": ["x"]}, rests_at_zero=True).check([Preparation("auto")], signal)
+        stated.check([Preparation(how)], signal)
+    StatedFacts(exclude={"v": ["x"]}, rests_at_zero=True).check([Preparation("auto")], signal)

@@ -10,7 +10,7 @@ import pytest
 import ep2sindy as ep
 from ep2sindy.library.relations import binding, complete, parse_relation
 from ep2sindy.model.stability import limit_cycle
-from ep2sindy.selection.systems import Confirmed, Trial, find_living, folds, list_others
+from ep2sindy.selection.systems import Confirmed, Trial, find_sustained, folds, list_others
 from tests.models import model_of
 
 PREY = replace(ep.lotka_volterra(), rate_Hz=5.0)  # 69 samples a period
@@ -63,12 +63,12 @@ def test_the_truth_is_found_refined_and_handed_on(found):
 def test_noise_is_no_obstacle():
     run = record(noise=0.1)
     noisy = ep.discover(run, LIBRARY, recipe(formulation=ep.WeightedWeak()))
-    judged = ep.evaluate(noisy.model, record())
+    assessed = ep.evaluate(noisy.model, record())
     # On the data's cycle; from one sample its phase may be off by more than a first period allows.
-    assert judged.status in (ep.model.Status.SUSTAINED, ep.model.Status.WRONG_FREQUENCY)
-    assert abs(judged.f_error) < 0.01
+    assert assessed.status in (ep.model.Status.SUSTAINED, ep.model.Status.WRONG_FREQUENCY)
+    assert abs(assessed.f_error) < 0.01
     # It lives, and yet it is not the truth: it leaves more than noise, and has no intervals.
-    assert noisy.misfit
+    assert noisy.lack_of_fit
     assert noisy.model.covariance is None
 
 
@@ -87,11 +87,11 @@ def test_a_state_that_was_not_measured_need_not_keep_its_waveform(found):
     wiggle = 0.4 * run.states[:, 1].std() * np.sin(10 * 2 * np.pi * run.t / 71.3e-6)
     spoilt = ep.Trajectory(run.t, run.states + np.outer(wiggle, [0, 1]), run.state_names)
     assert ep.evaluate(found.model, spoilt).status is ep.model.Status.WRONG_CYCLE
-    judged = ep.evaluate(found.model, spoilt, judged=["n_i"])
-    assert judged.status in (ep.model.Status.SUSTAINED, ep.model.Status.WRONG_FREQUENCY)
-    assert judged.waveform_error["n_n"] > 0.2
-    with pytest.raises(ValueError, match=r"judged must name some of the states .*, got \['T'\]"):
-        ep.evaluate(found.model, run, judged=["T"])
+    assessed = ep.evaluate(found.model, spoilt, assessed=["n_i"])
+    assert assessed.status in (ep.model.Status.SUSTAINED, ep.model.Status.WRONG_FREQUENCY)
+    assert assessed.waveform_error["n_n"] > 0.2
+    with pytest.raises(ValueError, match=r"assessed must name some of the states .*, got \['T'\]"):
+        ep.evaluate(found.model, run, assessed=["T"])
 
 
 def test_starts_at_other_phases_refuse_what_lives_from_one(found):
@@ -113,7 +113,7 @@ def test_noise_that_more_terms_follow_does_not_make_a_cycle_attract():
 
 def test_where_nothing_lives_the_best_comes_back_with_its_verdict():
     dead = ep.discover(record(), LIBRARY, recipe(max_terms=1, n_best=1))
-    assert dead.note.endswith("; none of 4 systems live where not fitted")
+    assert dead.note.endswith("; none of 4 systems are sustained where not fitted")
     assert not dead.note.startswith("sustained")
     assert dead.scores["n_i"].min() > 1.0
 
@@ -129,7 +129,7 @@ def test_a_record_without_a_cycle_is_judged_by_windows(run, reason):
     library = ep.polynomial(run.state_names, degree=2)
     other = ep.discover(run, library, recipe(max_terms=3, n_best=1))
     assert re.match(reason, other.note)
-    assert (other.model.covariance is None) == bool(other.misfit)
+    assert (other.model.covariance is None) == bool(other.lack_of_fit)
 
 
 @pytest.mark.parametrize("zeta", [pytest.param(-0.01, marks=pytest.mark.slow), 0.01])
@@ -190,9 +190,9 @@ def test_relations_hold_to_the_last_digit(rule):
     run = PREY.trajectory(noise=0.02, rng=0)
     how = replace(recipe(max_terms=2, n_best=1, formulation=ep.WeightedWeak()), selection=rule)
     library = ep.polynomial(["x", "y"], degree=2)
-    tied = ep.discover(run, library.relate(SHARED), how).model
-    assert tied.terms("x")["x*y"] == -tied.terms("y")["x*y"]
-    assert tied.terms("x")["x*y"] == pytest.approx(-1.0, rel=0.05)
+    coupled = ep.discover(run, library.relate(SHARED), how).model
+    assert coupled.terms("x")["x*y"] == -coupled.terms("y")["x*y"]
+    assert coupled.terms("x")["x*y"] == pytest.approx(-1.0, rel=0.05)
 
 
 def test_a_coefficient_keeps_the_value_it_is_given():
@@ -203,7 +203,7 @@ def test_a_coefficient_keeps_the_value_it_is_given():
     together = ep.discover(run, library.relate(value))
     for found in (fixed, together):
         assert found.model.terms("x")["x*y"] == -1.1
-        assert found.misfit  # ten percent off in two percent of noise
+        assert found.lack_of_fit  # ten percent off in two percent of noise
     assert fixed.model.terms("x")["x"] > free.model.terms("x")["x"] * 1.01
 
 
@@ -232,24 +232,28 @@ def test_supports_are_completed_by_what_relations_ask():
     assert binding([parse_relation("x: 1 == 2")], {"x": ("x",)}) is None
 
 
-def confirmed(*, share, n_free=4, waveform=0.05, loss=1.0, broken=(), lives=True, repels=False):
+def confirmed(
+    *, fraction, n_free=4, waveform=0.05, loss=1.0, broken=(), is_sustained=True, repels=False
+):
     """A system as the rule has confirmed it, with these figures."""
     held = SimpleNamespace(n_free=n_free)
-    run = SimpleNamespace(rank=(not lives, 0))
-    return Confirmed(Trial(held, 0.3, 0.0, 0.0, waveform, loss), None, broken, share, run, repels)
+    run = SimpleNamespace(rank=(not is_sustained, 0))
+    return Confirmed(
+        Trial(held, 0.3, 0.0, 0.0, waveform, loss), None, broken, fraction, run, repels
+    )
 
 
 @pytest.mark.parametrize(
     ("others", "best"),
     [
-        ([confirmed(share=0.6), confirmed(share=0.95, n_free=5)], 1),  # global attraction
-        ([confirmed(share=0.6), confirmed(share=0.8)], 1),  # most starts of equals
-        ([confirmed(share=0.6), confirmed(share=0.8, n_free=5)], 0),  # size
-        ([confirmed(share=0.92), confirmed(share=1.0)], 0),  # both global: the first
-        ([confirmed(share=0.0), confirmed(share=0.3, n_free=6)], 1),  # it attracts
-        ([confirmed(share=1.0, broken=["x: y < 0"]), confirmed(share=0.1)], 1),
-        ([confirmed(share=0.0, lives=False), confirmed(share=0.0)], 1),
-        ([confirmed(share=0.0, repels=True), confirmed(share=0.0, n_free=6)], 1),
+        ([confirmed(fraction=0.6), confirmed(fraction=0.95, n_free=5)], 1),  # global attraction
+        ([confirmed(fraction=0.6), confirmed(fraction=0.8)], 1),  # most starts of equals
+        ([confirmed(fraction=0.6), confirmed(fraction=0.8, n_free=5)], 0),  # size
+        ([confirmed(fraction=0.92), confirmed(fraction=1.0)], 0),  # both global: the first
+        ([confirmed(fraction=0.0), confirmed(fraction=0.3, n_free=6)], 1),  # it attracts
+        ([confirmed(fraction=1.0, broken=["x: y < 0"]), confirmed(fraction=0.1)], 1),
+        ([confirmed(fraction=0.0, is_sustained=False), confirmed(fraction=0.0)], 1),
+        ([confirmed(fraction=0.0, repels=True), confirmed(fraction=0.0, n_free=6)], 1),
     ],
 )
 def test_what_attracts_most_starts_is_preferred(others, best):
@@ -257,11 +261,11 @@ def test_what_attracts_most_starts_is_preferred(others, best):
 
 
 def test_what_attracts_outdoes_a_neutral_cycle_as_an_equal_or_by_its_fit():
-    resting = confirmed(share=0.0)
-    assert confirmed(share=1.0, waveform=0.07, loss=2.0).outdoes(resting)
-    assert not confirmed(share=1.0, waveform=0.08, loss=2.0).outdoes(resting)
-    assert not confirmed(share=1.0, n_free=5, loss=0.96).outdoes(resting)
-    assert confirmed(share=1.0, n_free=5, loss=0.94).outdoes(resting)
+    resting = confirmed(fraction=0.0)
+    assert confirmed(fraction=1.0, waveform=0.07, loss=2.0).outdoes(resting)
+    assert not confirmed(fraction=1.0, waveform=0.08, loss=2.0).outdoes(resting)
+    assert not confirmed(fraction=1.0, n_free=5, loss=0.96).outdoes(resting)
+    assert confirmed(fraction=1.0, n_free=5, loss=0.94).outdoes(resting)
 
 
 def trial(name, *, n_free=4, error=0.3, waveform=0.05, loss=1.0):
@@ -276,7 +280,7 @@ def test_where_the_truth_is_in_the_library_no_other_counts_as_equal(least, names
         trial("a", loss=least), trial("b"), trial("c", waveform=0.04), trial("d", n_free=5),
         trial("e", loss=least, waveform=0.06), trial("f", error=1.1),
     ]  # fmt: skip
-    found = list_others(find_living(trials), trials[0])
+    found = list_others(find_sustained(trials), trials[0])
     assert [other.terms["x'"] for other in found] == [(name,) for name in names]
 
 
@@ -292,8 +296,8 @@ def test_the_other_systems_that_live_are_kept() -> None:
         assert sum(map(len, other.terms.values())) == size
         assert other.terms != ours
         bounds = ep.model.FreeRunBounds()
-        shares = other.f_error / bounds.frequency, other.amplitude / bounds.amplitude
-        assert other.deviation == max(*shares, other.waveform / bounds.waveform) <= 1.0
+        fractions = other.f_error / bounds.frequency, other.amplitude / bounds.amplitude
+        assert other.deviation == max(*fractions, other.waveform / bounds.waveform) <= 1.0
     assert [o.waveform for o in found.others] == sorted(o.waveform for o in found.others)
     again = ep.Discovery.from_json(found.to_json())
     assert [each.terms for each in again.others] == [each.terms for each in found.others]

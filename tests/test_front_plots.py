@@ -44,12 +44,12 @@ def line(ax: Axes, label: str) -> Line2D:
 
 def test_the_cloud_holds_the_error_of_every_support_that_was_proposed(searched: Searched) -> None:
     front, masks = searched
-    assert front.cloud is not None
+    assert front.ensemble is not None
     fits = fit_supports(front.problem, front.equation, masks)
-    assert front.cloud.sizes.tolist() == [fit.n_terms for fit in fits]
+    assert front.ensemble.sizes.tolist() == [fit.n_terms for fit in fits]
     # Gram matrices square the condition of the rows, some 1e3 here.
     expected = [1.0 - fit.r2_test for fit in fits]
-    assert front.cloud.errors == pytest.approx(expected, rel=0, abs=1e-9)
+    assert front.ensemble.errors == pytest.approx(expected, rel=0, abs=1e-9)
 
 
 def test_errors_are_drawn_on_a_logarithmic_scale_with_all_supports_behind(
@@ -59,8 +59,8 @@ def test_errors_are_drawn_on_a_logarithmic_scale_with_all_supports_behind(
     ax = drawn(front)
     assert ax.get_yscale() == "log"
     every = line(ax, "all supports fitted")
-    assert front.cloud is not None
-    assert np.sum(front.cloud.errors > TOP) == 0
+    assert front.ensemble is not None
+    assert np.sum(front.ensemble.errors > TOP) == 0
     assert len(np.asarray(every.get_xdata())) == len(masks) > len(front.candidates)
     best, others = line(ax, "best of size"), line(ax, "runners-up")
     assert every.get_zorder() < others.get_zorder() < best.get_zorder()
@@ -77,7 +77,7 @@ def test_errors_of_exact_fits_stand_on_a_line_that_says_so(searched: Searched) -
         replace(each, r2_test=1.0 + 1e-15) if each.n_terms == 2 else each
         for each in front.candidates
     ]
-    ax = drawn(replace(front, candidates=exact, cloud=None))
+    ax = drawn(replace(front, candidates=exact, ensemble=None))
     heights = np.asarray(line(ax, "best of size").get_ydata())
     assert heights.min() == FLOOR > ax.get_ylim()[0]
     assert [text.get_text() for text in ax.texts] == ["$10^{-12}$ or less"]
@@ -86,8 +86,8 @@ def test_errors_of_exact_fits_stand_on_a_line_that_says_so(searched: Searched) -
 
 def test_supports_far_worse_than_none_are_marked_at_the_edge(searched: Searched) -> None:
     front, _ = searched
-    assert front.cloud is not None
-    errors = np.append(front.cloud.errors[:-1], 1e6)
-    ax = drawn(replace(front, cloud=replace(front.cloud, errors=errors)))
+    assert front.ensemble is not None
+    errors = np.append(front.ensemble.errors[:-1], 1e6)
+    ax = drawn(replace(front, ensemble=replace(front.ensemble, errors=errors)))
     (carets,) = [each for each in ax.lines if np.asarray(each.get_ydata()).tolist() == [TOP]]
-    assert np.asarray(carets.get_xdata()).tolist() == [front.cloud.sizes[-1]]
+    assert np.asarray(carets.get_xdata()).tolist() == [front.ensemble.sizes[-1]]

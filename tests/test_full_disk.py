@@ -1,4 +1,4 @@
-"""A disk that takes no more: one message with the path and the way out, and whole files."""
+"""A disk that takes no more: one message with the path and a hint, and whole files."""
 
 import os
 import pickle
@@ -43,9 +43,9 @@ def test_no_netcdf_writer_falls_over_on_a_full_disk(tmp_path: Path) -> None:
         [sys.executable, "-c", WRITE], cwd=tmp_path, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
-    said = done.stdout.splitlines()
-    assert [line.partition(" could")[0] for line in said] == ["field.nc", "kept.nc"]
-    assert all("File too large" in line and "make room there" in line for line in said)
+    stated = done.stdout.splitlines()
+    assert [line.partition(" could")[0] for line in stated] == ["field.nc", "kept.nc"]
+    assert all("File too large" in line and "make room there" in line for line in stated)
     assert (tmp_path / "field.nc").read_text() == "earlier"
     assert [path.name for path in tmp_path.iterdir()] == ["field.nc"]
 
@@ -73,14 +73,14 @@ def test_a_board_that_cannot_be_written_is_named(tmp_path: Path) -> None:
 def test_only_what_killed_processes_left_is_swept(tmp_path: Path) -> None:
     deeper = tmp_path / "run" / "figures"
     deeper.mkdir(parents=True)
-    with replacing(deeper / "a.b.nc") as living:
-        living.write_text("being written")
-        left = living.with_name(living.name.replace("a.b", "c"))
+    with replacing(deeper / "a.b.nc") as sustained:
+        sustained.write_text("being written")
+        left = sustained.with_name(sustained.name.replace("a.b", "c"))
         others = [deeper / ".hidden-0-1.nc", deeper / "mine.nc"]
         then = time.time() - 1.1 * LEFT_AFTER_S
         for path in (left, *others):
             path.write_text("x")
             os.utime(path, (then, then))
         sweep(tmp_path)
-        assert living.exists()
+        assert sustained.exists()
     assert sorted(deeper.iterdir()) == sorted([*others, deeper / "a.b.nc"])

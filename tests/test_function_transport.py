@@ -1,4 +1,4 @@
-"""Transport by a user's function: what it gets, what it may give, and how it is told apart."""
+"""Transport by a user's function: what it gets, what it may give, and how it is distinguished."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -78,7 +78,10 @@ def test_a_function_sees_the_plasma_and_the_time():
         (gives_nan, r"everywhere: .*gives_nan \w+ gave nan at 0\.833 mm .* t = 2\.1e-05"),
         (Level(-0.1), r"everywhere: .*Level \w+ gave -0\.1 at -24\.2 mm from the exit"),
         (gives_too_few, r"one coefficient for each of 30 distances, .* gave the shape \(3,\)"),
-        (partial(default_c), r"must be known by its source, .*: functools\.partial.* frozen data"),
+        (
+            partial(default_c),
+            r"must be known by its source, .*, got functools\.partial.* frozen data",
+        ),
         ("no_such_module.c", r"must be a function of yours, as my_module\.c, .* has no no_such"),
     ],
 )

@@ -337,8 +337,8 @@ def beside_a_pole(noise: float) -> ep.Trajectory:
     truth = model_of({"x": {"v": 1.0}, "v": {"1/x": 1.0, "x": -1.0, "v": -0.02}})
     clean = truth.simulate(np.arange(0.0, 30.0, 0.05), [2.5, 0.0]).trajectory()
     spread = noise * np.sqrt(np.square(clean.states).mean(axis=0))
-    pushed = spread * np.random.default_rng(0).standard_normal(clean.states.shape)
-    return replace(clean, states=clean.states + pushed)
+    with_process_noise = spread * np.random.default_rng(0).standard_normal(clean.states.shape)
+    return replace(clean, states=clean.states + with_process_noise)
 
 
 def test_noise_that_carries_samples_past_a_pole_hides_no_law() -> None:
@@ -414,9 +414,9 @@ def test_a_run_may_start_outside_a_domain_or_be_driven_out_of_it() -> None:
 def test_leaving_a_domain_is_a_verdict() -> None:
     model = model_of({"x": {"1": -1.0, "log(x)": 0.1}})
     run = ep.Trajectory(T, (np.cos(T) + 1.2)[:, None], ["x"])
-    judged = ep.evaluate(model, run)
-    assert judged.status is ep.model.Status.LEAVES_DOMAIN
-    assert judged.text.startswith("leaves the domain of log(x) after 2.1")
+    assessed = ep.evaluate(model, run)
+    assert assessed.status is ep.model.Status.LEAVES_DOMAIN
+    assert assessed.text.startswith("leaves the domain of log(x) after 2.1")
 
 
 def test_only_functions_that_end_somewhere_have_edges() -> None:
@@ -493,8 +493,8 @@ def test_a_pendulum_is_found_in_noise_and_runs_on_its_own(
     speed, restoring = found.model.terms("theta")["w"], found.model.terms("w")["sin(theta)"]
     energy = 0.5 * speed * w**2 + restoring * np.cos(theta)
     assert np.ptp(energy) < 1e-4  # of some 4
-    judged = ep.evaluate(found.model, truth)
-    assert judged.status in (ep.model.Status.SUSTAINED, ep.model.Status.WRONG_FREQUENCY)
+    assessed = ep.evaluate(found.model, truth)
+    assert assessed.status in (ep.model.Status.SUSTAINED, ep.model.Status.WRONG_FREQUENCY)
 
 
 def test_intervals_hold_the_truth_where_functions_bend_in_noise() -> None:

@@ -76,7 +76,7 @@ def test_a_hidden_state_is_found_beside_a_gap() -> None:
     prey = Trajectory(GAPPY.t, GAPPY.columns(["x"]), ["x"])
     found = ep.discover(prey, hidden=["g"])
     assert list(found.model.terms("g")) == ["1", "x", "g", "x*g"]
-    assert not found.misfit
+    assert not found.lack_of_fit
 
 
 def test_a_derivative_takes_no_samples_from_beyond_a_gap() -> None:

@@ -24,7 +24,7 @@ def test_arrays_are_named_x() -> None:
 
 
 def test_numbered_columns_are_named_as_those_of_arrays() -> None:
-    """A state called 1 could not be told from the constant term."""
+    """A state called 1 could not be distinguished from the constant term."""
     table = pd.DataFrame(X).assign(t=T)
     assert trajectories_of(table)[0].state_names == ("x0", "x1")
 
@@ -56,8 +56,8 @@ def test_columns_that_repeat_are_refused() -> None:
         ([], "at least one run is needed, got an empty list"),
         ([T, X], "a run must be a Trajectory, a pandas DataFrame .* run 0 of the list is of type"),
         (pd.DataFrame({"x": T}), r"must have one time column, .* its columns are \['x'\]"),
-        (pd.DataFrame({"t": T, "x": ["a"] * len(T)}), "must hold real numbers: {'x': .*; drop"),
-        (pd.DataFrame({"t": T > 0, "x": T}), "{.t., got .bool.}; give time in s, as numbers or"),
+        (pd.DataFrame({"t": T, "x": ["a"] * len(T)}), "must hold real numbers, got {'x': .*; drop"),
+        (pd.DataFrame({"t": T > 0, "x": T}), "{.t.: .bool.}; give time in s, as numbers or"),
         ((T, X.T), r"must have shapes .*, got \(31,\) and \(2, 31\)"),
         ((T, X + 1j), "states must hold real numbers, got complex128"),
     ],

@@ -212,7 +212,10 @@ def test_a_plume_that_is_solved_is_thermal(folder: Path, corrected: bool) -> Non
         ({"LANDMARK": True}, r"config\.LANDMARK is not supported here but at False"),
         ({"domian": [0, 1]}, r"config has keys that are not supported: \['domian'\]"),
         ({"domain": [0.01, 0.08]}, r"config\.domain must begin at the anode"),
-        ({"discharge_voltage": "300 V"}, r"config\.discharge_voltage must be a number: '300 V'"),
+        (
+            {"discharge_voltage": "300 V"},
+            r"config\.discharge_voltage must be a number, got '300 V'",
+        ),
         ({"propellants": [{}, {}]}, r"a mixture of 2 is not supported"),
         (
             {"propellants": [{"flow_rate_kg_s": 5e-6, "max_charge": 4}]},

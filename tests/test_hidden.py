@@ -12,7 +12,7 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import _hidden_names
 from ep2sindy.estimation import estimate, explanation
 from ep2sindy.estimation.explanation import Explanation
-from ep2sindy.estimation.hidden import Entrance, entrances, with_guess, with_guess_by, with_guesses
+from ep2sindy.estimation.hidden import Coupling, couplings, with_guess, with_guess_by, with_guesses
 from ep2sindy.estimation.likelihood import TrajectoryFit, hessian_on, observe
 from ep2sindy.estimation.noise import noise_beside
 from ep2sindy.estimation.problem import EstimationProblem, scale_problem
@@ -35,7 +35,7 @@ def found() -> ep.Discovery:
 
 
 def test_the_law_of_one_species_alone(found: ep.Discovery) -> None:
-    assert found.misfit == ""
+    assert found.lack_of_fit == ""
     assert found.model.terms("x") == {"x*g": 1.0}
     own = found.model.terms("g")
     assert set(own) == set(GROWTH)
@@ -99,7 +99,7 @@ def test_the_experiment_finds_it_too(tmp_path) -> None:
     assert set(terms) == set(GROWTH)
     assert terms["x*g"] == pytest.approx(1.0, rel=1e-12)
     assert list(summary["samples_model"][0]["noise_std"]) == ["x"]
-    with pytest.raises(ValueError, match="one library and without living"):
+    with pytest.raises(ValueError, match="one library and sustained=none"):
         computed(composed("+exp=breathing", "+hidden=[g]", f"output={tmp_path}"))
 
 
@@ -141,7 +141,7 @@ def test_a_relation_sets_the_scale() -> None:
 
 def test_ways_in_from_one_state() -> None:
     library = ep.polynomial(["x", "v", "h"], degree=2)
-    ways = entrances(library, ["x"], ["v", "h"])
+    ways = couplings(library, ["x"], ["v", "h"])
     assert {way.term for way, _ in ways} == {"v", "x*v"}
     assert {(way.state, way.term) for _, way in ways} == {("v", "h"), ("v", "x*h"), ("v", "v*h")}
     assert len(ways) == 6
@@ -149,13 +149,13 @@ def test_ways_in_from_one_state() -> None:
 
 def test_ways_in_from_two_states_and_by_a_relation() -> None:
     library = ep.polynomial(["x", "y", "z"], degree=2)
-    ways = entrances(library, ["x", "y"], ["z"])
+    ways = couplings(library, ["x", "y"], ["z"])
     terms = {"z", "x*z", "y*z"}
     assert {(w.state, w.term) for (w,) in ways} == {(s, t) for s in "xy" for t in terms}
     fixed = library.relate("2 * y: x*z == -4")
-    assert entrances(fixed, ["x", "y"], ["z"]) == [(Entrance("z", "y", "x*z", -2.0, given=True),)]
+    assert couplings(fixed, ["x", "y"], ["z"]) == [(Coupling("z", "y", "x*z", -2.0, given=True),)]
     with pytest.raises(ValueError, match="'z' has none in"):
-        entrances(ep.polynomial(["x", "y"], degree=2), ["x", "y"], ["z"])
+        couplings(ep.polynomial(["x", "y"], degree=2), ["x", "y"], ["z"])
 
 
 def test_only_positive_states_have_growth_rates_which_come_first() -> None:
@@ -181,10 +181,10 @@ def test_ways_are_followed_that_process_noise_explains(monkeypatch: pytest.Monke
     monkeypatch.setattr(estimate, "explain", explain)
     lorenz = only("x", noise=0.01, system=ep.lorenz())
     library = ep.polynomial(["x", "v", "h"], degree=2)
-    assert not ep.estimate(lorenz, library, hidden=["v", "h"]).misfit
+    assert not ep.estimate(lorenz, library, hidden=["v", "h"]).lack_of_fit
     assert followed == [True]  # of three ways
     followed.clear()
-    assert ep.estimate(walk(lorenz.t), library, hidden=["v", "h"]).misfit
+    assert ep.estimate(walk(lorenz.t), library, hidden=["v", "h"]).lack_of_fit
     assert followed
     assert not any(followed)
 
@@ -198,7 +198,7 @@ def walk(t: np.ndarray) -> Trajectory:
 def test_guesses_are_close_without_noise() -> None:
     run, library = only("x", noise=0.0), ep.polynomial(["x", "g"], degree=2)
     truth = 2.0 / 3.0 - PLANE.trajectory().columns(["y"])[:, 0]
-    guess = with_guess(run, library, [Entrance("g", "x", "x*g")]).columns(["g"])[:, 0]
+    guess = with_guess(run, library, [Coupling("g", "x", "x*g")]).columns(["g"])[:, 0]
     inner = slice(20, -20)
     # The division is held back a little where the factor is small.
     assert np.corrcoef(guess[inner], truth[inner])[0, 1] > 0.98
@@ -220,8 +220,8 @@ def test_a_hidden_state_that_follows_nothing_is_astray() -> None:
         (still, False),
     ):
         path = np.column_stack([np.sin(np.arange(40.0)), hidden])
-        share = hidden_defects(TrajectoryFit(problem, noise, 1e-4, path, free, everything))
-        assert (share > MAX_HIDDEN_DEFECT).tolist() == [False, is_astray]
+        fraction = hidden_defects(TrajectoryFit(problem, noise, 1e-4, path, free, everything))
+        assert (fraction > MAX_HIDDEN_DEFECT).tolist() == [False, is_astray]
 
 
 def test_what_was_not_measured_counts_nothing() -> None:
@@ -248,7 +248,7 @@ def test_what_was_not_measured_counts_nothing() -> None:
     ("call", "message"),
     [
         (lambda: ep.discover(only("x"), hidden=["x"]), "one that no run has, got .'x'. with"),
-        (lambda: ep.discover(only("x"), hidden=["g", "g"]), "got 'g'. with samples or twice"),
+        (lambda: ep.discover(only("x"), hidden=["g", "g"]), "'g'. with samples or twice"),
         (
             lambda: ep.discover(only("x"), method=ep.Regression(), hidden=["g"]),
             "a regression needs samples of every state",

@@ -145,8 +145,8 @@ def test_without_units_short_names_stay_and_what_is_plasma_is_offered(tmp_path: 
     units = {name: variable.unit for name, variable in found.variables.items()}
     assert units == {"n_i": "m^-3", "n_n": "m^-3", "u_iz": "m/s", "Te": "1"}
     assert found.lacking(["T_e_eV"])
-    said = "data.plasma=true takes 'out/Te' for T_e_eV, and what has no unit for SI"
-    assert said in found.notes()
+    stated = "data.plasma=true takes 'out/Te' for T_e_eV, and what has no unit for SI"
+    assert stated in found.notes()
     assert "T_e_eV" in ep.inspect_file(tmp_path / "a.h5", plasma=True).variables
 
 
@@ -231,8 +231,8 @@ def test_equal_lengths_are_asked_not_guessed(tmp_path: Path) -> None:
     np.savez(tmp_path / "a.npz", t=T, z=Z, r=R[0] + Z, ni=square, I_d=WAVE[:, 0, 0])
     found = recognise(open_source(tmp_path / "a.npz"), plasma=True)
     assert "n_i" not in found.variables
-    said = "'ni' of shape (40, 7, 7) may be [time,z,r] or [time,r,z]"
-    assert any(said in question for question in found.questions)
+    stated = "'ni' of shape (40, 7, 7) may be [time,z,r] or [time,r,z]"
+    assert any(stated in question for question in found.questions)
 
 
 def test_two_names_for_one_quantity_are_asked(tmp_path: Path) -> None:
@@ -340,17 +340,17 @@ def test_time_that_does_not_increase_is_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("files", "said"),
+    ("files", "stated"),
     [
         (["a.csv", "b.csv", "notes.md"], r"take its 2 files that end in .csv, '.*runs/\*.csv'"),
         ([], "is a folder, with no files in it"),
     ],
 )
-def test_a_folder_says_the_way(tmp_path: Path, files: list[str], said: str) -> None:
+def test_a_folder_says_the_way(tmp_path: Path, files: list[str], stated: str) -> None:
     (tmp_path / "runs").mkdir()
     for name in files:
         (tmp_path / "runs" / name).write_text("t,x\n0,1\n")
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=stated):
         ep.inspect_file(tmp_path / "runs")
 
 

@@ -84,8 +84,10 @@ def test_matlab_objects_are_named_and_take_nothing_with_them(tmp_path: Path) -> 
         file["TT"].attrs["MATLAB_object_decode"] = np.int32(3)
     shown = str(inspect_file(path))
     assert re.search(r"TT +left out", shown)
-    said = "'TT' is left out: 'TT' is a MATLAB timetable, of which the file holds references: save"
-    assert said in " ".join(shown.split())
+    stated = (
+        "'TT' is left out: 'TT' is a MATLAB timetable, of which the file holds references: save"
+    )
+    assert stated in " ".join(shown.split())
     assert open_field(path, **SETTINGS)["n_i"].dims == ("time", "z", "r")
 
 
@@ -137,7 +139,7 @@ def test_structs_and_groups_are_paths(tmp_path: Path) -> None:
         assert np.array_equal(field["n_i"].values, N_I[:, 0, 0])
 
 
-@pytest.mark.parametrize("given", [True, False], ids=["given", "told by lengths"])
+@pytest.mark.parametrize("given", [True, False], ids=["given", "determined by lengths"])
 @pytest.mark.parametrize("dims", [("r", "z", "time"), ("z", "time", "r"), ("time", "r", "z")])
 def test_dimension_orders_are_undone(tmp_path: Path, dims: tuple[str, ...], given: bool) -> None:
     order = [("time", "z", "r").index(d) for d in dims]
@@ -202,7 +204,7 @@ def test_conversion_factors(ours: str, unit: str, factor: float, target: str) ->
 @pytest.mark.parametrize(
     ("ours", "unit", "message"),
     [
-        ("p", "furlongg^-3", "the unit of p must be one that converts to SI: 'furlongg"),
+        ("p", "furlongg^-3", "the unit of p must be one that converts to SI, got 'furlongg"),
         ("n_i", "s", "the unit of n_i must be one that converts to m\\^-3, got 's'"),
         ("n_i", "", "got ''"),
         ("T_e_eV", "m", "the unit of T_e_eV must be one that converts to eV, got 'm'"),
@@ -367,12 +369,12 @@ def test_what_is_no_file_of_a_known_kind_is_refused(
 CUT = [n for n in (*WRITERS, "table.xlsx", "table.parquet") if not n.endswith("zarr")]
 
 
-@pytest.mark.parametrize("share", [0.02, 0.5, 0.95])
+@pytest.mark.parametrize("fraction", [0.02, 0.5, 0.95])
 @pytest.mark.parametrize("name", CUT)
-def test_a_truncated_file_is_refused(tmp_path: Path, name: str, share: float) -> None:
+def test_a_truncated_file_is_refused(tmp_path: Path, name: str, fraction: float) -> None:
     KINDS[name](tmp_path / name)
     content = (tmp_path / name).read_bytes()
-    (tmp_path / name).write_bytes(content[: int(share * len(content))])
+    (tmp_path / name).write_bytes(content[: int(fraction * len(content))])
     with pytest.raises(ValueError, match=f"{name} (cannot be read|begins with)"):
         open_field(tmp_path / name, **SETTINGS)
 

@@ -174,8 +174,8 @@ def test_files_and_functions_stay_short() -> None:
         for node in ast.walk(tree(path)):
             if isinstance(node, ast.FunctionDef):
                 # An explanation makes no function long.
-                told = len((ast.get_docstring(node) or "").splitlines())
-                n_lines = (node.end_lineno or node.lineno) - node.lineno + 1 - told
+                stated = len((ast.get_docstring(node) or "").splitlines())
+                n_lines = (node.end_lineno or node.lineno) - node.lineno + 1 - stated
                 if n_lines > 50:
                     long.append(f"{module}.{node.name} takes {n_lines} lines, over 50")
     assert not long, "\n".join(long)

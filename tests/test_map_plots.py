@@ -27,14 +27,14 @@ def study() -> xr.Dataset:
     n_i' = -40 n_i u_iz; n_n' = 10^22..10^24 at z < 1 cm, 3e4 n_n beyond.
     """
     coef, weight = np.zeros((2, 2, 3, 5, 4))
-    share = np.ones((2, 3, 5, 4))
-    share[0, 2, :, 0] = 0.25  # of the bootstraps have n_i*u_iz at the inner wall
+    fraction = np.ones((2, 3, 5, 4))
+    fraction[0, 2, :, 0] = 0.25  # of the bootstraps have n_i*u_iz at the inner wall
     coef[0, 2], weight[0, 2] = -40.0, -1.0
     coef[1, 0, :2], weight[1, 0, :2] = np.logspace(22, 24, 8).reshape(2, 4), 1.0
     coef[1, 1, 2:], weight[1, 1, 2:] = 3e4, 1.0
     lost = np.zeros((5, 4), dtype=bool)
     lost[-1] = True
-    result = point_study(coef, weight, lost, terms=TERMS, share=share)
+    result = point_study(coef, weight, lost, terms=TERMS, fraction=fraction)
     one = 0.0 * result["n_terms"] + 1.0
     r2 = xr.DataArray([0.8, -3.0], dims="equation")
     return result.assign(r2_train=0.9 * one, r2_test=r2 * one)

@@ -53,5 +53,7 @@ def test_other_functions_and_inputs_prove_nothing() -> None:
     turning = ep.SparseModel(library, ["x"], np.array([[0.0], [-1.0], [0.5]]), {"x": "1"})
     assert consequences(turning) == []
     driven = ep.polynomial(["x", "u"], degree=1)
-    pushed = ep.SparseModel(driven, ["x"], np.array([[0.0], [-1.0], [0.5]]), {"x": "1", "u": "1"})
-    assert consequences(pushed) == []
+    with_process_noise = ep.SparseModel(
+        driven, ["x"], np.array([[0.0], [-1.0], [0.5]]), {"x": "1", "u": "1"}
+    )
+    assert consequences(with_process_noise) == []

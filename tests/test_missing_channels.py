@@ -26,7 +26,7 @@ def every_third(run: ep.Trajectory, state: int = 2) -> ep.Trajectory:
 def test_a_slow_channel_is_taken_as_it_was_measured() -> None:
     run = LORENZ.trajectory(noise=0.1, rng=0)
     found = ep.estimate(every_third(run), LIBRARY)
-    assert not found.misfit
+    assert not found.lack_of_fit
     assert found.remarks == ("z was measured at 1000 of 3000 samples",)
     for state in run.state_names:
         assert set(found.model.terms(state)) == set(LORENZ.model.terms(state))
@@ -114,7 +114,9 @@ def test_an_equation_that_is_closed_holds_beside_one_that_is_not() -> None:
     two = ep.Trajectory(run.t, run.states[:, :2], ["x", "y"])
     found = ep.estimate(two, ep.polynomial(["x", "y"], degree=2))
     assert found.explained_states == ("x",)
-    assert found.misfit.startswith("no law of this library explains y: a term or a state is missi")
+    assert found.lack_of_fit.startswith(
+        "no law of this library explains y: a term or a state is missi"
+    )
     assert found.model.terms("x") == pytest.approx({"x": -10.0, "y": 10.0}, rel=0.02)
     assert found.process_noise_std[1] > 5.0 * found.process_noise_std[0]
     assert found.model.covariance is None
@@ -129,8 +131,8 @@ def test_a_single_state_that_swings_lacks_another() -> None:
     one = ep.Trajectory(run.t[::3], run.states[::3, :1], ["x"])
     assert unobserved_state(problem_of(one)).startswith("x passes the same values up and down")
     found = ep.estimate(one, ep.polynomial(["x"], degree=2))
-    assert "A state is missing for certain: x passes the same" in found.misfit
-    assert "Name a hidden state (hidden=[...])" in found.misfit
+    assert "A state is missing for certain: x passes the same" in found.lack_of_fit
+    assert "Name a hidden state (hidden=[...])" in found.lack_of_fit
 
 
 def test_a_path_that_crosses_itself_lacks_a_state() -> None:

@@ -39,7 +39,7 @@ def test_a_time_that_is_no_date_is_missing() -> None:
     ],
 )
 def test_what_is_no_real_number_is_refused(values: object, match: str) -> None:
-    with pytest.raises(ValueError, match=f"states must hold real numbers: .*{match}"):
+    with pytest.raises(ValueError, match=f"states must hold real numbers.*{match}"):
         real_numbers(values, "states")
 
 
@@ -86,7 +86,7 @@ def test_epoch_seconds_are_even_but_for_their_rounding() -> None:
     ("t", "states", "message"),
     [
         (T, X + 1j, "states must hold real numbers"),
-        (list("01234567"), X, "t must hold real numbers: <U1"),
+        (list("01234567"), X, "t must hold real numbers, got <U1"),
         (T, X > 0.5, "states must hold real numbers"),
         (T, 1e-300 * X, "a variable must be of a size"),
     ],

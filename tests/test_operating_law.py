@@ -117,8 +117,8 @@ def test_the_law_of_a_known_family_is_found() -> None:
         ({"points": np.ones((4, 3))}, r"a column for each of \['a', 'b'\]"),
         ({"points": np.ones((0, 2))}, "a column for each"),
         ({"points": np.full((4, 2), np.inf)}, "points must be finite"),
-        ({"covariance": np.eye(4)}, r"that of 12 numbers: shape \(4, 4\)"),
-        ({"left_out": np.zeros(4)}, r"an error for each of 9 points: shape \(4,\)"),
+        ({"covariance": np.eye(4)}, r"that of 12 numbers, got shape \(4, 4\)"),
+        ({"left_out": np.zeros(4)}, r"an error for each of 9 points, got shape \(4,\)"),
     ],
 )
 def test_a_law_holds_numbers_that_fit_each_other(change: dict, message: str) -> None:
@@ -229,7 +229,7 @@ def test_points_left_out_live_by_the_law_of_the_others() -> None:
     assert [each.inside for each in found].count(True) == 5
     assert all(each.attracts for each in found)
     numbers = error_statistics(found)
-    assert (numbers["n"], numbers["n_lives"], numbers["diverging"]) == (9, 9, 0)
+    assert (numbers["n"], numbers["n_sustained"], numbers["diverging"]) == (9, 9, 0)
     assert numbers["f_90"] < 5e-3
 
 
@@ -237,7 +237,7 @@ def test_a_point_without_a_frequency_has_an_infinite_error_of_it() -> None:
     found = run_left_out(trial(), records())
     gone = replace(found[0].run, status=Status.DIVERGES, f_error=float("nan"))
     numbers = error_statistics([LeftOutRun(records()[0], gone, inside=True), *found[1:]])
-    assert numbers["n_lives"] == 8
+    assert numbers["n_sustained"] == 8
     assert numbers["f_90"] == np.inf
     assert numbers["f_median"] < 5e-3
 
@@ -245,7 +245,7 @@ def test_a_point_without_a_frequency_has_an_infinite_error_of_it() -> None:
 def test_windows_tell_the_true_model_from_a_biased_one_and_one_that_blows_up() -> None:
     (point,), record = GRID[4:5], records()[4]
     true = model_at(**point)
-    biased, wild = (replace(true, coef=share * true.coef) for share in (1.02, -30.0))
+    biased, wild = (replace(true, coef=fraction * true.coef) for fraction in (1.02, -30.0))
     right, off, gone = window_errors([true, biased, wild], record.run)
     assert right < 1e-4
     assert 100.0 * right < off < 1.0
@@ -302,9 +302,7 @@ def test_a_point_that_the_law_needs_cannot_be_left_out() -> None:
         fit(), points=fit().points[corner], models=[fit().models[k] for k in corner],
         information=fit().information[corner],
     )  # fmt: skip
-    with pytest.raises(
-        ValueError, match="a law of 3 functions .* more points than these.*, got 3"
-    ):
+    with pytest.raises(ValueError, match="a law of 3 functions .* more points than these.*, got 3"):
         three.rate_errors(LINEAR)
     with pytest.raises(ValueError, match="a law of 3 terms needs as many points, got 2"):
         three.law_without(0, LINEAR)
@@ -319,9 +317,7 @@ def test_a_law_that_is_tested_needs_a_point_more_than_it_has_functions() -> None
     corners = points[[0, 2, 6]]
     make_basis(LINEAR, corners)
     make_basis(LINEAR, points[[0, 2, 6, 8]], n_spare=1)
-    with pytest.raises(
-        ValueError, match="a law of 3 functions .* more points than these.*, got 3"
-    ):
+    with pytest.raises(ValueError, match="a law of 3 functions .* more points than these.*, got 3"):
         make_basis(LINEAR, corners, n_spare=1)
 
 

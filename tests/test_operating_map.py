@@ -48,7 +48,7 @@ def test_a_cycle_begins_where_the_fixed_point_turns_unstable() -> None:
     assert [p.inside for p in found] == [False, False, False, True]
     for point in found[2:]:
         assert point.frequency_Hz == pytest.approx(0.5 / np.pi, rel=1e-6)
-        # A departure along the radius decays by exp(-2 a t).
+        # A perturbation along the radius decays by exp(-2 a t).
         expected = np.exp(-4.0 * np.pi * point.parameters["a"])
         assert point.second == pytest.approx(expected, rel=1e-3, abs=1e-6)
     assert np.isnan(found[0].frequency_Hz)

@@ -72,7 +72,7 @@ def outside(ax: Axes) -> list[Text]:
 
 
 def meet(one: Bbox, other: Bbox) -> bool:
-    """Whether boxes share more than a pixel's edge."""
+    """Whether boxes fraction more than a pixel's edge."""
     shared = Bbox.intersection(one, other)
     return shared is not None and min(shared.width, shared.height) > 1.0
 

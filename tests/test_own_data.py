@@ -1,4 +1,4 @@
-"""A file of one's own on the command line: looked into, written down, run, and said."""
+"""A file of one's own on the command line: looked into, written down, run, and stated."""
 
 import json
 import re
@@ -43,10 +43,10 @@ def test_two_commands_lead_from_a_file_to_its_equations(
 ) -> None:
     lorenz_csv(folder / "scope.csv", lost=5)
     assert not ended("inspect", "scope.csv", "--write")
-    said = capsys.readouterr().out
-    assert "between semicolons, decimal commas, rows from line 5" in said
+    stated = capsys.readouterr().out
+    assert "between semicolons, decimal commas, rows from line 5" in stated
     command = "ep2sindy +exp=discover data=scope 'trajectory.states=[x,y,z]'"
-    assert command in said
+    assert command in stated
     rest = ["trajectory.states=[x,y,z]", "search=best_subset", "selection=ebic"]
     assert not ended("+exp=discover", "data=scope", *rest)
     (run,) = (folder / "outputs" / "discover").iterdir()
@@ -136,10 +136,10 @@ def test_several_records_are_shown_once_and_go_to_what_takes_several(
         lorenz_csv(folder / f"{name}.csv", seed=seed)
     (folder / "b.csv").write_text("\n".join((folder / "b.csv").read_text().split("\n")[:900]))
     assert not ended("inspect", "a.csv", "b.csv", "c d.csv")
-    said = capsys.readouterr().out
-    assert said.count("taken as") == 1
-    assert "\nthe other 2 files: the same arrays; 896 to 1000 samples\n" in said
-    (line,) = re.findall(r"ep2sindy (\+exp=.*)", said)
+    stated = capsys.readouterr().out
+    assert stated.count("taken as") == 1
+    assert "\nthe other 2 files: the same arrays; 896 to 1000 samples\n" in stated
+    (line,) = re.findall(r"ep2sindy (\+exp=.*)", stated)
     config = composed(*shlex.split(line))
     assert config.experiment == "discover"
     assert config.data.path == ["a.csv", "b.csv", "c d.csv"]
@@ -158,13 +158,13 @@ def test_files_are_compared_with_the_first(folder: Path, capsys: pytest.CaptureF
         (folder / f"{name}.csv").write_text(text)
     (folder / "e.csv").write_text((folder / "e.csv").read_text().replace("x", "y", 1))
     assert not ended("inspect", "?.csv")
-    said = capsys.readouterr().out
-    assert "b.csv: t: 2e-06 apart" in said
-    assert "c.csv: x: 10 missing" in said
-    assert "d.csv: I_d: mA, taken as I_d in mA" in said
-    assert "e.csv: without x; also y" in said
-    assert "files of one mapping must hold the same names: e.csv differs from a.csv" in said
-    assert "+exp=discover data" not in said
+    stated = capsys.readouterr().out
+    assert "b.csv: t: 2e-06 apart" in stated
+    assert "c.csv: x: 10 missing" in stated
+    assert "d.csv: I_d: mA, taken as I_d in mA" in stated
+    assert "e.csv: without x; also y" in stated
+    assert "files of one mapping must hold the same names: e.csv differs from a.csv" in stated
+    assert "+exp=discover data" not in stated
 
 
 def test_a_gap_leaves_the_step_as_it_is(folder: Path, capsys: pytest.CaptureFixture) -> None:
@@ -173,9 +173,9 @@ def test_a_gap_leaves_the_step_as_it_is(folder: Path, capsys: pytest.CaptureFixt
     (folder / "a.csv").write_text("\n".join(lines[:204] + lines[704:]))
     step = ep.inspect_file("whole.csv").held[0].step
     assert not ended("inspect", "a.csv")
-    said = capsys.readouterr().out
-    assert f"about {step:.4g} apart" in said
-    assert "have a gap: " in said
+    stated = capsys.readouterr().out
+    assert f"about {step:.4g} apart" in stated
+    assert "have a gap: " in stated
     found = computed(composed(
         "+exp=discover", "data=recognised", "data.path=a.csv", "trajectory.states=[x,y,z]",
         "search=best_subset", "selection=ebic", f"output={folder}",
@@ -186,7 +186,7 @@ def test_a_gap_leaves_the_step_as_it_is(folder: Path, capsys: pytest.CaptureFixt
 
 
 @pytest.mark.parametrize(
-    ("header", "times", "dt_s", "said_s"),
+    ("header", "times", "dt_s", "stated_s"),
     [
         ("t (ms)", 20.0 * np.arange(50), 1.0, "0.02"),
         ("t (ms)", 20.0 * np.arange(50), 0.02, ""),
@@ -198,19 +198,19 @@ def test_a_gap_leaves_the_step_as_it_is(folder: Path, capsys: pytest.CaptureFixt
     ],
 )
 def test_a_step_that_contradicts_the_files_times_is_told(
-    folder: Path, header: str, times: np.ndarray, dt_s: float, said_s: str
+    folder: Path, header: str, times: np.ndarray, dt_s: float, stated_s: str
 ) -> None:
     rows = "\n".join(f"{t:.9g},{k % 7}" for k, t in enumerate(times))
     (folder / "a.csv").write_text(f"{header},V\n{rows}\n")
-    with warnings.catch_warnings(record=True) as said:
+    with warnings.catch_warnings(record=True) as stated:
         warnings.simplefilter("always")
         field = ep.open_field("a.csv", dt_s=dt_s)
     assert field.time[1] == dt_s  # taken in any case
-    texts = [str(each.message) for each in said if each.category is DoubtfulUnit]
-    assert len(texts) == bool(said_s)
+    texts = [str(each.message) for each in stated if each.category is DoubtfulUnit]
+    assert len(texts) == bool(stated_s)
     for text in texts:
         assert f"dt_s={dt_s:g} is taken" in text
-        assert f"'t', which go in steps of {said_s} s" in text
+        assert f"'t', which go in steps of {stated_s} s" in text
 
 
 def test_a_step_that_contradicts_a_mapping_is_told(folder: Path) -> None:

@@ -91,27 +91,27 @@ def test_every_piece_is_done_once_and_keeps_its_number(workers: Workers) -> None
 
 
 def test_rows_come_in_the_order_of_their_pieces() -> None:
-    told: list[int] = []
-    rows = rows_in_order(Backwards(), repeated, [3, 0, 2], "piece", as_progress(told.append))
+    stated: list[int] = []
+    rows = rows_in_order(Backwards(), repeated, [3, 0, 2], "piece", as_progress(stated.append))
     assert rows == [3, 3, 3, 2, 2]
-    assert told == [1, 1, 1]
+    assert stated == [1, 1, 1]
     with pytest.raises(ValueError, match="there must be something to run, got 1 pieces"):
         rows_in_order(Serial(), repeated, [0], "piece")
 
 
 def test_results_come_in_the_order_of_their_pieces_and_are_told_as_they_come() -> None:
     advanced: list[int] = []
-    told: list[tuple[int, list[int]]] = []
+    stated: list[tuple[int, list[int]]] = []
     results = collect(
         Backwards(),
         repeated,
         [3, 0, 2],
         nullcontext(advanced.append),
         size=lambda piece: 10 * piece,
-        tell=lambda number, result: told.append((number, result)),
+        tell=lambda number, result: stated.append((number, result)),
     )
     assert results == [[3, 3, 3], [], [2, 2]]
-    assert told == [(2, [2, 2]), (1, []), (0, [3, 3, 3])]
+    assert stated == [(2, [2, 2]), (1, []), (0, [3, 3, 3])]
     assert advanced == [20, 0, 30]
 
 
@@ -180,11 +180,11 @@ def test_workers_need_not_have_the_folder_of_a_function(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("address", "way_out"),
+    ("address", "hint"),
     [("tcp://127.0.0.1:9", " within 0.1 s: .*start "), ("nowhere:nothing", "")],
 )
-def test_an_address_where_nothing_answers_is_named(address: str, way_out: str) -> None:
-    with pytest.raises(OSError, match=rf"must answer at '{address}'{way_out}"):
+def test_an_address_where_nothing_answers_is_named(address: str, hint: str) -> None:
+    with pytest.raises(OSError, match=rf"must answer at '{address}'{hint}"):
         list(Dask(address, timeout_s=0.1).run(total, PIECES))
 
 
@@ -285,7 +285,7 @@ WORK = {"waiting": ("", "signal.pause()"), "computing": (COMPILED.strip(), COMPU
     ],
 )
 def test_workers_end_with_their_run(tmp_path: Path, name: str, work: str) -> None:
-    """A worker is in its work when it next looks at its parent: it has said so just before."""
+    """A worker is in its work when it next looks at its parent: it has stated so just before."""
     preparation, endless = WORK[work]
     script = tmp_path / "run.py"
     script.write_text(KILLED.replace("PREPARATION", preparation).replace("WORK", endless))
@@ -303,9 +303,9 @@ def test_workers_end_with_their_run(tmp_path: Path, name: str, work: str) -> Non
         _, alive = psutil.wait_procs(workers, timeout=PATIENCE_S)
         for each in alive:
             each.kill()
-        said = run.stdout.read()
+        stated = run.stdout.read()
     assert not alive
-    assert said == ("" if name == "SIGKILL" else f"interrupted by {name}\n")
+    assert stated == ("" if name == "SIGKILL" else f"interrupted by {name}\n")
 
 
 def test_workers_that_are_replaced_cause_no_warning_and_others_still_do() -> None:

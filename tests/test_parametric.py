@@ -254,7 +254,7 @@ def correlated_problem(rng: np.random.Generator, *, n_rows: int) -> RegressionRo
 
 
 def coverage(*, block: int, n_seeds: int) -> float:
-    """Share of 95 % intervals that hold the true coefficient."""
+    """Fraction of 95 % intervals that hold the true coefficient."""
     library = ep.named_terms(["a", "b"], ["a", "b"])
     relations = ep.library.constraint(library, {"z": ["a", "b"]})
     quantities = {"p": Quantity("z: a"), "q": Quantity("z: b", -1.0)}
@@ -269,7 +269,7 @@ def coverage(*, block: int, n_seeds: int) -> float:
 
 
 def test_intervals_hold_the_truth_where_rows_depend_on_each_other() -> None:
-    # 800 intervals: two standard deviations of a share of 0.95 are 0.015; blocks of twenty keep
+    # 800 intervals: two standard deviations of a fraction of 0.95 are 0.015; blocks of twenty keep
     # most of the memory of five rows, and fifty of them are few, which costs some more.
     assert 0.88 < coverage(block=20, n_seeds=400) < 0.99
     # Row by row the variance is (1 + 0.64) / (1 - 0.64) = 4.6 times too small: 0.95 becomes 0.64.
@@ -367,11 +367,14 @@ def test_control_laws_may_hold_reciprocals_of_what_is_never_zero() -> None:
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: Quantity("x"), "a quantity needs a coefficient such as 'n_i: n_i*u_iz': 'x'"),
-        (lambda: Quantity("x: x", power=2), "the factor not zero and the power 1 or -1: factor=1"),
+        (lambda: Quantity("x"), "a quantity needs a coefficient such as 'n_i: n_i*u_iz', got 'x'"),
+        (
+            lambda: Quantity("x: x", power=2),
+            "the factor not zero and the power 1 or -1, got factor=1",
+        ),
         (
             lambda: FittingSettings(LIBRARY, WEAK, n_windows=1, periods=0.5),
-            "refinement needs two windows or more, of some length: n_windows=1 and periods=0.5",
+            "refinement needs two windows or more, of some length, got n_windows=1 and periods=0.5",
         ),
         (
             lambda: Quantity("x: 1").place(MODELS["free"].relations.common, LIBRARY),

@@ -99,8 +99,8 @@ def rates_of(gas, grid, model, state):
     born = state.ionization[:, None] * n * nn
     speed2 = model.electron_sound_squared * state.T_e_eV + model.ion_sound_squared
     wider = speed2[:, None] * n * np.diff(grid.perimeter) / grid.area  # pressure along r
-    push = E_CHARGE / model.ion_mass * n * state.E + born * model.neutral_speed
-    rates = np.array([born, push, wider, -born])
+    momentum_gain = E_CHARGE / model.ion_mass * n * state.E + born * model.neutral_speed
+    rates = np.array([born, momentum_gain, wider, -born])
     for j in range(grid.n_r):
         first = 0 if inside[0, j] else grid.exit_column
         line = (q[first:, j] for q in (n, u, v, nn))

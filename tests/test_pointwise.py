@@ -195,11 +195,9 @@ def test_what_makes_no_sense_is_refused() -> None:
         ep.pointwise(field.drop_vars("w"), searching(), workers=Serial())
     with pytest.raises(ValueError, match="needs a grid: this field has time alone"):
         ep.pointwise(field.isel(z=0, r=0, drop=True), searching(), workers=Serial())
-    with pytest.raises(
-        ValueError, match="block_points must be a whole number, one or more, got 0"
-    ):
+    with pytest.raises(ValueError, match="block_points must be a whole number, one or more, got 0"):
         ep.pointwise(field, searching(), workers=Serial(), block_points=0)
-    with pytest.raises(ValueError, match="needs bootstraps for its spread: n=0"):
+    with pytest.raises(ValueError, match="needs bootstraps for its spread, got n=0"):
         searching(bootstraps=ep.Bootstraps(n=0))
     with pytest.raises(ValueError, match=r"least_variation must lie in \[0, 1\)"):
         searching(least_variation=1.0)
@@ -276,7 +274,8 @@ def test_relations_tie_equations_at_every_point_and_in_every_draw() -> None:
         np.testing.assert_allclose(*np.broadcast_arrays(exact[name], expected), rtol=1e-6)
     np.testing.assert_allclose(exact["r2_test"], 1.0, rtol=1e-9)
     noisy, free = (
-        ep.pointwise(exchanging(0.05), sharing(*tied), workers=Serial()) for tied in ([SHARED], [])
+        ep.pointwise(exchanging(0.05), sharing(*coupled), workers=Serial())
+        for coupled in ([SHARED], [])
     )
     for name in ("coef", "coef_draws"):
         x, y = (noisy[name].sel(term="u", equation=e) for e in ("x", "y"))
@@ -300,7 +299,7 @@ def test_a_draw_of_all_rows_is_the_fit_of_all_rows() -> None:
 
 
 def test_relations_that_cannot_hold_are_refused_at_once() -> None:
-    with pytest.raises(ValueError, match="n_culled must be 0, 1"):
+    with pytest.raises(ValueError, match="n_culled must be 0, got 1"):
         sharing(SHARED, bootstraps=ep.Bootstraps(n=4, n_culled=1))
     with pytest.raises(ValueError, match="'v'"):
         sharing("x: v == -1 * y: v")

@@ -32,7 +32,7 @@ def study() -> xr.Dataset:
     coef, weight, draws = (v.reshape(*v.shape[:-1], 4, 3) for v in (coef, weight, draws))
     lost = np.zeros((4, 3), dtype=bool)
     lost[-1, -1] = True
-    return point_study(coef, weight, lost, terms=TERMS, share=np.abs(weight), draws=draws)
+    return point_study(coef, weight, lost, terms=TERMS, fraction=np.abs(weight), draws=draws)
 
 
 def written(result: xr.Dataset, folder: Path) -> Path:
@@ -50,7 +50,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return written(study(), tmp_path_factory.mktemp("outputs"))
 
 
-def said(folder: Path) -> tuple[str, str]:
+def stated(folder: Path) -> tuple[str, str]:
     """The log in one line, and the page."""
     log = " ".join((folder / "run.log").read_text().split())
     return log, unescape((folder / "report.html").read_text())
@@ -58,12 +58,12 @@ def said(folder: Path) -> tuple[str, str]:
 
 def test_equations_without_terms_are_counted(folder: Path) -> None:
     assert summary_of(folder)["no_terms"] == {"n_i": 2}
-    for text in said(folder):
+    for text in stated(folder):
         assert "11 fitted, 1 no plasma; no term in n_i' at 2" in text
 
 
 def test_medians_come_with_their_spread_and_the_share_of_points(folder: Path) -> None:
-    html = said(folder)[1]
+    html = stated(folder)[1]
     lines = (folder / "run.log").read_text().splitlines()
     rows = [[cell.strip() for cell in line.split("│")] for line in lines]
     for acts, cells in (
@@ -72,13 +72,13 @@ def test_medians_come_with_their_spread_and_the_share_of_points(folder: Path) ->
         ("", ["n_n'", "1", "29%", "1e+20", "1e+20", "1e+20", "m^-3 s^-1"]),
     ):
         assert cells in rows
-        state, term, share = cells[:3]
-        row = f'<td>{state}</td><td>{term}</td><td class="number">{share}</td>'
+        state, term, fraction = cells[:3]
+        row = f'<td>{state}</td><td>{term}</td><td class="number">{fraction}</td>'
         assert f'<tr class="{acts}">{row}' in html
 
 
 def test_points_of_low_confidence_are_counted(folder: Path) -> None:
-    for text in said(folder):
+    for text in stated(folder):
         assert "3 regimes; confidence below 0.5 at 9% of points" in text
         assert "Regime 1: 3 points, confidence 0.67, below 0.5 at 33%" in text
 
@@ -89,4 +89,4 @@ def test_a_study_without_any_term_has_no_table_of_them(tmp_path: Path) -> None:
         result[name] *= 0.0
     folder = written(result, tmp_path)
     assert summary_of(folder)["no_terms"] == {"n_i": 11, "n_n": 11}
-    assert "points that have it</th>" not in said(folder)[1]
+    assert "points that have it</th>" not in stated(folder)[1]

@@ -158,14 +158,14 @@ def test_a_condition_must_compare_places(condition: str) -> None:
         keep_where(grid(), condition=condition)
 
 
-def warm() -> xr.Dataset:
+def precompile() -> xr.Dataset:
     T = np.outer(np.linspace(1.0, 2.0, N), [5.0, 10.0, np.nan])
     return field(T_e_eV=(("time", "z"), T, "eV"))
 
 
 def test_the_rate_comes_from_the_fits() -> None:
-    after = ionization_rate(warm())
-    expected = propellants.ionization_rate(warm()["T_e_eV"].values[:, :2])
+    after = ionization_rate(precompile())
+    expected = propellants.ionization_rate(precompile()["T_e_eV"].values[:, :2])
     assert np.array_equal(after["R_ion"].values[:, :2], expected)
     assert np.isnan(after["R_ion"].values[:, 2]).all()
     assert after["R_ion"].attrs == {"units": "m^3/s"}
@@ -178,8 +178,8 @@ TABLE = (
 
 def test_the_rate_comes_from_a_table(tmp_path: Path) -> None:
     (tmp_path / "rates.csv").write_text(TABLE)
-    after = ionization_rate(warm(), table=tmp_path / "rates.csv")
-    expected = 2e-14 + 2e-15 * (warm()["T_e_eV"].values - 5.0)
+    after = ionization_rate(precompile(), table=tmp_path / "rates.csv")
+    expected = 2e-14 + 2e-15 * (precompile()["T_e_eV"].values - 5.0)
     assert after["R_ion"].values[:, :2] == pytest.approx(expected[:, :2], rel=1e-12)
     assert np.isnan(after["R_ion"].values[:, 2]).all()
 
@@ -187,7 +187,7 @@ def test_the_rate_comes_from_a_table(tmp_path: Path) -> None:
 def test_a_table_is_not_extrapolated(tmp_path: Path) -> None:
     (tmp_path / "rates.csv").write_text("1,1e-22\n15,5e-14\n")
     with pytest.raises(ValueError, match="1 to 15 eV: it runs from 5 to 20 eV; extend .*rates.csv"):
-        ionization_rate(warm(), table=tmp_path / "rates.csv")
+        ionization_rate(precompile(), table=tmp_path / "rates.csv")
 
 
 @pytest.mark.parametrize("text", ["1,1e-22\n", "5,1\n1,2\n", "a,b\nc,d\n"])
@@ -199,12 +199,12 @@ def test_a_bad_table_is_refused(tmp_path: Path, text: str) -> None:
 
 def test_a_missing_table_is_named(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="no such rate table: .*none.csv"):
-        ionization_rate(warm(), table=tmp_path / "none.csv")
+        ionization_rate(precompile(), table=tmp_path / "none.csv")
 
 
 def test_the_rate_is_never_overwritten_nor_guessed() -> None:
     with pytest.raises(ValueError, match="the field already has R_ion: leave this step out"):
-        ionization_rate(ionization_rate(warm()))
+        ionization_rate(ionization_rate(precompile()))
     with pytest.raises(ValueError, match=r"R_ion needs T_e_eV; this field has \['I_d'\]"):
         ionization_rate(ramp())
 
@@ -244,8 +244,8 @@ def test_mid_radius_without_a_radial_velocity_is_refused() -> None:
 
 @pytest.mark.parametrize("gas", ["krypton", "argon"])
 def test_other_gases_have_rates_of_their_own(gas: str) -> None:
-    after = ionization_rate(warm(), gas=gas)
-    T = warm()["T_e_eV"].values
+    after = ionization_rate(precompile(), gas=gas)
+    T = precompile()["T_e_eV"].values
     known = propellant(gas)
     expected = np.interp(T, known.T_e_eV, known.ionization_rate)
     np.testing.assert_array_equal(after["R_ion"].values[np.isfinite(T)], expected[np.isfinite(T)])
@@ -253,14 +253,14 @@ def test_other_gases_have_rates_of_their_own(gas: str) -> None:
 
 
 def test_a_gas_has_its_range_and_its_own_table(tmp_path: Path) -> None:
-    hot = warm()
+    hot = precompile()
     hot["T_e_eV"] *= 20
     with pytest.raises(ValueError, match="T_e_eV must stay in the rate table, 0 to 100 eV"):
         ionization_rate(hot, gas="krypton")
     with pytest.raises(ValueError, match="there are the propellants .*, got 'neon'"):
-        ionization_rate(warm(), gas="neon")
+        ionization_rate(precompile(), gas="neon")
     with pytest.raises(ValueError, match="got gas='argon' beside"):
-        ionization_rate(warm(), gas="argon", table=tmp_path / "rates.csv")
+        ionization_rate(precompile(), gas="argon", table=tmp_path / "rates.csv")
 
 
 Z_UNEVEN = np.array([0.0, 1.0, 3.0, 3.5])
@@ -333,8 +333,8 @@ def test_a_gradient_without_faces_takes_the_average_of_the_product() -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"of": "n_i", "axis": "r"}, r"two or more cells along z or r: .*'z', got 4.*"),
-        ({"of": "I_d"}, r"gradient of 'I_d' along 'z' needs .*sizes \{'time', got 2\}"),
+        ({"of": "n_i", "axis": "r"}, r"two or more cells along z or r.*'z': 4.*"),
+        ({"of": "I_d"}, r"gradient of 'I_d' along 'z' needs .*sizes \{'time': 2\}"),
         ({"of": "n_i", "name": "n_i"}, "already has 'n_i'"),
     ],
 )

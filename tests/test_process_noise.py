@@ -16,11 +16,11 @@ VAN_DER_POL = replace(ep.systems.van_der_pol(), duration_s=12.0)
 N_SUBSTEPS = 10  # of the Euler-Maruyama scheme, around exact steps of the law
 
 
-def moved(system: System, share: float, seed: int, *, noise: float = 0.01) -> Trajectory:
-    """A record whose states process noise moves by a share of their RMS in ten samples."""
+def moved(system: System, fraction: float, seed: int, *, noise: float = 0.01) -> Trajectory:
+    """A record whose states process noise moves by a fraction of their RMS in ten samples."""
     rng, clean = np.random.default_rng(seed), system.trajectory()
     rms = np.sqrt(np.square(clean.states).mean(axis=0))
-    size = share * rms / np.sqrt(10 * N_SUBSTEPS)
+    size = fraction * rms / np.sqrt(10 * N_SUBSTEPS)
     h, none = clean.dt_s / N_SUBSTEPS, np.empty(0)
     x, states = clean.states[0].copy(), [clean.states[0].copy()]
     for _ in range(clean.n_samples - 1):
@@ -33,13 +33,13 @@ def moved(system: System, share: float, seed: int, *, noise: float = 0.01) -> Tr
 
 
 def counted(system: System, degree: int, seeds: range) -> tuple[int, int, int]:
-    """Right supports without a misfit, and intervals of them that hold, of how many."""
+    """Right supports without a lack of fit, and intervals of them that hold, of how many."""
     right = held = n = 0
     for seed in seeds:
         run = moved(system, 0.02, seed)
         found = ep.discover(run, ep.polynomial(run.state_names, degree=degree))
         truth = system.model
-        if found.misfit or any(
+        if found.lack_of_fit or any(
             set(found.model.terms(s)) != set(truth.terms(s)) for s in truth.states
         ):
             continue
@@ -91,13 +91,13 @@ def test_what_a_library_lacks_is_no_process_noise(noise: float) -> None:
     assert not found.fits
 
 
-@pytest.mark.slow  # an equation without one of its states is told so in the fast suite
+@pytest.mark.slow  # an equation without one of its states is stated so in the fast suite
 def test_an_equation_that_lacks_no_term_is_told_from_one_that_does() -> None:
     """x' lacks x^3, and the linear y' is right."""
     run = VAN_DER_POL.trajectory(noise=0.05, rng=0)
     found = ep.estimate(run, ep.polynomial(run.state_names, degree=2))
     assert found.explained_states == ("y",)
-    assert "this library lacks terms: with products up to degree 3" in found.misfit
+    assert "this library lacks terms: with products up to degree 3" in found.lack_of_fit
     assert found.model.terms("y") == pytest.approx({"x": 0.5}, rel=0.03)
 
 

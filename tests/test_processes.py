@@ -29,7 +29,7 @@ LAW = {
 
 
 def held_by(roles: ep.Roles):
-    return constraint_of(LIBRARY, STATES, roles.processes(LIBRARY, STATES), roles.told)
+    return constraint_of(LIBRARY, STATES, roles.processes(LIBRARY, STATES), roles.stated)
 
 
 def texts(roles: ep.Roles, coef, **options) -> list[str]:
@@ -63,7 +63,7 @@ def test_latex_and_pages_say_the_same() -> None:
 
 
 def test_signs_are_those_of_the_coefficients() -> None:
-    """An exchange that goes back, one of both signs, and a term that was told beside one found."""
+    """An exchange that goes back, one of both signs, and a term stated next to one found."""
     roles = replace(
         ROLES,
         exchange=[("n_n", "n_i", ["n_i*n_n", "n_n"]), ("n_i", "n_n", {"n_i": 1e5})],
@@ -84,7 +84,7 @@ def test_signs_are_those_of_the_coefficients() -> None:
 
 @pytest.mark.parametrize("back", [["n_i"], {"n_i": 1e5}])
 def test_an_interval_of_a_sum_is_not_that_of_its_processes(back) -> None:
-    """Ions return and leave by n_i: only n_n' tells what returns, and a told process has none."""
+    """Ions return and leave by n_i: only n_n' tells what returns, and a stated process has none."""
     exchange = [("n_n", "n_i", ["n_i*n_n"]), ("n_i", "n_n", back)]
     roles = replace(ROLES, exchange=exchange, outflow={"n_i": ["n_i"], "n_n": ["n_n"]})
     coef = {
@@ -109,7 +109,7 @@ def test_a_small_zone_gives_a_large_one_less() -> None:
     chosen = {}
     for process in roles.processes(library, names):
         chosen.setdefault(process.role, process)
-    held = constraint_of(library, names, [*chosen.values()], roles.told)
+    held = constraint_of(library, names, [*chosen.values()], roles.stated)
     free = [held.coefficients[k][0] for k in held.free]
     coef = held.coef(np.array([1.0 if state.startswith("n_i") else -1.0 for state in free]))
     given = {s: {} for s in names}

@@ -1,4 +1,4 @@
-"""Stages of long work: who is told of them, how bars look, and that results know nothing of it."""
+"""Stages of long work: who is informed, how bars look, and that results do not change."""
 
 import inspect
 import io
@@ -12,7 +12,7 @@ import pytest
 
 import ep2sindy as ep
 from ep2sindy._stubs import dotted_names
-from ep2sindy.runtime.progress import SILENT, Bars, Told, as_progress, count_pieces
+from ep2sindy.runtime.progress import SILENT, Bars, Stated, as_progress, count_pieces
 
 LIBRARY = ep.polynomial(["x", "y"], degree=2)
 BRIEF = {"duration_s": 3e-5, "warm_up_s": 3e-6}
@@ -139,8 +139,8 @@ def test_true_means_bars_and_a_function_is_told() -> None:
     assert as_progress(False) is SILENT
     watch, numbers = Recorder(), []
     assert as_progress(watch) is watch
-    told = as_progress(numbers.append)
-    assert isinstance(told, Told)
-    with told.stage(2, "point") as advance:
+    stated = as_progress(numbers.append)
+    assert isinstance(stated, Stated)
+    with stated.stage(2, "point") as advance:
         advance(2)
     assert numbers == [2]

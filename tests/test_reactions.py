@@ -23,7 +23,7 @@ CATALYSED = ep.Roles(exchange=[("E + S", "C"), ("C", "E + P")], nonnegative=True
 
 
 def record(equations: dict, start: tuple, end_s: float, noise: float, seed: int) -> ep.Trajectory:
-    """A run of 400 samples with white noise, as a share of each state's RMS."""
+    """A run of 400 samples with white noise, as a fraction of each state's RMS."""
     t = np.linspace(0.0, end_s, 400)
     path = model_of(equations).simulate(t, np.array(start)).states
     size = noise * np.sqrt(np.square(path).mean(axis=0))
@@ -67,7 +67,7 @@ def test_bad_reactions_say_what_must_hold():
     with pytest.raises(ValueError, match=r"must name states, got \['Q'\]"):
         processes(ep.Roles(exchange=[("A + Q", "B")]), "A B")
     lacking = ep.Roles(exchange=[("A + A + A", "B", ["A^2"])], nonnegative=True)
-    with pytest.raises(ValueError, match=r"what lowers 'A \+ A \+ A' contains it: \['A\^2'\]"):
+    with pytest.raises(ValueError, match=r"what lowers 'A \+ A \+ A' contains it, got \['A\^2'\]"):
         processes(lacking, "A B")
     with pytest.raises(ValueError, match="take terms by neighbourhood"):
         JOINING.in_zones({"near": 1.0, "far": 1.0})
@@ -109,11 +109,11 @@ def test_a_config_tells_roles(tmp_path):
         "+exp=discover", "data=recognised", f"data.path={tmp_path / 'run.csv'}",
         "trajectory.states=[A,B,C]", "forecasts=0", f"output={tmp_path}",
     )  # fmt: skip
-    told = "roles={_target_: ep2sindy.Roles, exchange: [['A + B', C]], nonnegative: true}"
-    found = programs.computed(programs.composed(*given, told))
+    stated = "roles={_target_: ep2sindy.Roles, exchange: [['A + B', C]], nonnegative: true}"
+    found = programs.computed(programs.composed(*given, stated))
     terms = found.summary["models"]["model"]["equations"]
     assert terms["A"] == pytest.approx(terms["B"])
     assert terms["A"] == pytest.approx({term: -coef for term, coef in terms["C"].items()})
     assert list(terms["C"]) == ["C", "A*B"]
     with pytest.raises(ValueError, match=r"must name states, got \['Q'\]"):
-        programs.computed(programs.composed(*given, told.replace("A + B", "A + Q")))
+        programs.computed(programs.composed(*given, stated.replace("A + B", "A + Q")))

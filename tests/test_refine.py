@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 import ep2sindy as ep
 from benchmarks.nelder_mead import NelderMead
 from benchmarks.refine import START, STATES, TRUTH, breathing_states, contaminated
-from ep2sindy.refinement.judge import is_stationary
+from ep2sindy.refinement.assess import is_stationary
 from ep2sindy.refinement.methods.gradient_descent import GradientDescent
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.problem import Iteration, Method
@@ -35,7 +35,7 @@ def clean(system: System) -> ep.Trajectory:
 
 
 def noisy(system: System, noise: float, rng: np.random.Generator) -> ep.Trajectory:
-    """White noise of a share of each state's standard deviation."""
+    """White noise of a fraction of each state's standard deviation."""
     exact = clean(system)
     std = exact.states.std(axis=0)
     return replace(
@@ -48,8 +48,8 @@ def errors(found: Refinement, truth: ep.SparseModel) -> np.ndarray:
     return found.model.coef.T[used] / truth.coef.T[used] - 1.0
 
 
-def spread(model: ep.SparseModel, share: float, rng: np.random.Generator) -> ep.SparseModel:
-    return off(model, 1.0 + share * rng.choice([-1.0, 1.0], model.coef.shape))
+def spread(model: ep.SparseModel, fraction: float, rng: np.random.Generator) -> ep.SparseModel:
+    return off(model, 1.0 + fraction * rng.choice([-1.0, 1.0], model.coef.shape))
 
 
 @pytest.mark.parametrize("free_start", [True, False])
@@ -246,7 +246,10 @@ def test_windows_are_as_many_periods_as_are_asked_for() -> None:
     [
         ({"window": 4}, "at least one window of 5 samples is needed: n_windows=30, window=4"),
         ({"n_windows": 0}, "n_windows must be a whole number, one or more, got 0"),
-        ({"window": 20, "periods": 1.0}, "by its samples or by its periods: window=20 and periods"),
+        (
+            {"window": 20, "periods": 1.0},
+            "by its samples or by its periods, got window=20 and periods",
+        ),
         ({"periods": 0.0}, "periods must be positive, got 0.0"),
     ],
 )
@@ -375,7 +378,9 @@ def test_bad_input_is_refused() -> None:
         ep.refine(off(model, 0.0), [data], seed=rng)
     with pytest.raises(ValueError, match="at least one run is needed"):
         ep.refine(model, [], window=50)
-    with pytest.raises(ValueError, match="a list of trajectories of its own: 2 models and 1 lists"):
+    with pytest.raises(
+        ValueError, match="a list of trajectories of its own, got 2 models and 1 lists"
+    ):
         ep.refine([model] * 2, [[data]], ep.refinement.RefinementSettings(window=50), seed=rng)
     for runs, came in ((data, "one run"), ([data], "a list of runs")):
         with pytest.raises(ValueError, match=f"as in refine.* 1 models with {came}"):

@@ -57,11 +57,11 @@ def test_block_split_holds_out_whole_blocks() -> None:
 
 
 @pytest.mark.parametrize(
-    ("split", "share"), [(ep.regression.RandomSplit, 1.0), (ep.regression.BlockSplit, -0.1)]
+    ("split", "fraction"), [(ep.regression.RandomSplit, 1.0), (ep.regression.BlockSplit, -0.1)]
 )
-def test_impossible_shares_are_refused(split: type, share: float) -> None:
+def test_impossible_shares_are_refused(split: type, fraction: float) -> None:
     with pytest.raises(ValueError, match=r"test_fraction must lie in \[0, 1\)"):
-        split(share)
+        split(fraction)
 
 
 def test_gram_matrix_is_the_weighted_product_of_unit_columns() -> None:

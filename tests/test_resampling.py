@@ -57,5 +57,7 @@ def test_blocks_never_cross_trajectories() -> None:
         [run, run], system.model.library, rng=np.random.default_rng(0)
     )
     terms = np.ones(len(system.model.library), dtype=np.bool_)
-    with pytest.raises(ValueError, match="cross from one trajectory to the next: 2 trajectories"):
+    with pytest.raises(
+        ValueError, match="cross from one trajectory to the next, got 2 trajectories"
+    ):
         Bootstraps(block=2).draw(problem, terms, np.random.default_rng(0))

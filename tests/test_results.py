@@ -21,7 +21,10 @@ METRICS: list[Metric[Fit]] = [
     Metric("r2", lambda fit: fit.r2, View.ALL, heading="R2 of {}", format="{:.2f}"),
     Metric("r2_text", lambda fit: str(fit.r2)),
 ]
-FITS = {"free": Fit(0.012, {"x": 0.5, "y": 0.25}), "tied": Fit(float("nan"), {"x": 1.0, "y": 0.0})}
+FITS = {
+    "free": Fit(0.012, {"x": 0.5, "y": 0.25}),
+    "coupled": Fit(float("nan"), {"x": 1.0, "y": 0.0}),
+}
 TABLE = ResultTable(FITS, METRICS)
 
 
@@ -33,7 +36,7 @@ def test_a_row_per_record_spreads_states_over_columns() -> None:
 
 def test_a_row_per_state_repeats_what_has_no_states() -> None:
     table = TABLE.csv("fit", by_state=True)
-    assert table["fit"].tolist() == ["free", "free", "tied", "tied"]
+    assert table["fit"].tolist() == ["free", "free", "coupled", "coupled"]
     assert table["state"].tolist() == ["x", "y", "x", "y"]
     assert table["r2"].tolist() == [0.5, 0.25, 1.0, 0.0]
     assert table["f_error"][:2].tolist() == [0.012, 0.012]
@@ -50,7 +53,7 @@ def test_of_several_states_the_first_row_alone_has_what_they_share() -> None:
     metrics = [METRICS[1], Metric("r2", lambda fit: fit.r2, View.SCREEN, heading="R2")]
     table = ResultTable(FITS, metrics).screen("fit", by_state=True)
     assert table.to_dict("list") == {
-        "fit": ["free", "", "tied", ""],
+        "fit": ["free", "", "coupled", ""],
         "state": ["x", "y", "x", "y"],
         "its error": ["1.2 %", "", "-", ""],
         "R2": [0.5, 0.25, 1.0, 0.0],
@@ -76,7 +79,7 @@ def test_no_records_make_no_rows() -> None:
 
 
 def test_a_metric_is_taken_of_a_part_of_a_larger_record() -> None:
-    pair = {"first": FITS["free"], "second": FITS["tied"]}
+    pair = {"first": FITS["free"], "second": FITS["coupled"]}
     metrics: list[Metric[Mapping[str, Fit]]] = [
         m.of(lambda p: p["second"], "{}_second") for m in METRICS[:3]
     ]

@@ -50,7 +50,7 @@ def test_every_role_has_its_terms_and_no_other():
 
 def test_the_constraint_is_that_of_the_processes():
     chosen = processes(("n_n to n_i", "n_i*n_n"), ("n_n to n_i", "n_i"), ("n_i out", "n_i"))
-    held = constraint_of(LIBRARY, STATES, chosen, ep.Roles(inflow={"n_n": 7.0}).told)
+    held = constraint_of(LIBRARY, STATES, chosen, ep.Roles(inflow={"n_n": 7.0}).stated)
     assert held.coefficients == (
         ("n_i", "n_i"), ("n_i", "n_i*n_n"), ("n_n", "1"), ("n_n", "n_i"), ("n_n", "n_i*n_n"),
     )  # fmt: skip
@@ -87,7 +87,7 @@ def record() -> ep.Trajectory:
 
 
 def refined(max_terms: int) -> ep.Regression:
-    """A search whose systems are refined and judged whole."""
+    """A search whose systems are refined and assessed whole."""
     search = ep.BestSubset(max_terms=max_terms, n_best=60)
     return ep.Regression(search=search, selection=ep.FreeRunScore(bounds=None), depth=6)
 
@@ -156,15 +156,15 @@ def amounts_of(found) -> list:
 
 
 def test_what_is_told_is_kept_beside_what_is_found(record):
-    """n_n leaves by S + B, told apart as an outflow and a seed: the seed alone is to be found."""
-    told = {"n_n out": {"n_n": B}, "n_n in": {"1": M}, "n_i out": {"n_i": A}}
+    """n_n leaves by S + B, stated as an outflow and a seed: only the seed is to be found."""
+    stated = {"n_n out": {"n_n": B}, "n_n in": {"1": M}, "n_i out": {"n_i": A}}
     roles = ep.Roles(
         exchange=[("n_n", "n_i")], outflow={"n_n": "known", "n_i": "known or free"},
         inflow={"n_n": "known"}, nonnegative=True,
     )  # fmt: skip
     assert roles.open == ["n_n out", "n_i out", "n_n in"]
     method = refined(3)
-    found = ep.discover(record, LIBRARY.with_roles(roles.with_known(told)), method)
+    found = ep.discover(record, LIBRARY.with_roles(roles.with_known(stated)), method)
     assert {(p.role, p.term) for p in found.constraint.processes} == {
         ("n_n to n_i", "n_n"), ("n_n to n_i", "n_i*n_n")
     }  # fmt: skip
@@ -205,7 +205,7 @@ def test_bad_roles_say_what_must_hold(make, message):
     [
         ({"method": ep.TrajectorySearch(selection=ep.FreeRunScore())}, "keeps roles by likelihood"),
         ({"method": ep.TrajectorySearch(), "hidden": ["g"]}, "roles need samples of every state"),
-        ({"method": ep.Regression()}, "a rule must judge whole systems"),
+        ({"method": ep.Regression()}, "a rule must rank whole systems"),
         ({"method": refined(1)}, "plays all of the roles"),
     ],
 )  # fmt: skip
@@ -241,7 +241,7 @@ def test_a_known_equation_is_kept_and_its_terms_stand_in_no_other() -> None:
     assert whole.names == (*library.names, "n_i^2*n_n")
     processes = roles.processes(library, STATES)
     assert [(p.role, p.term) for p in processes] == [("n_i out", "n_i"), ("n_i out", "n_i^2")]
-    held = constraint_of(whole, STATES, processes[:1], roles.told)
+    held = constraint_of(whole, STATES, processes[:1], roles.stated)
     assert held.coefficients == (("n_i", "n_i"), ("n_n", "1"), ("n_n", "n_i^2*n_n"))
     assert held.coef(np.array([-5.0])).tolist() == [-5.0, -1.0, 2.0]
 

@@ -25,7 +25,7 @@ COEF = st.sampled_from([-3.0, -0.5, 0.7, 2.0])
 
 @dataclass(frozen=True)
 class Rows:
-    """Terms and a target that is a sum of few of them, with noise of a share of its size."""
+    """Terms and a target that is a sum of few of them, with noise of a fraction of its size."""
 
     theta: np.ndarray
     target: np.ndarray
@@ -139,6 +139,6 @@ def test_a_column_that_says_nothing_new_is_in_no_candidate(
 def test_a_number_that_is_none_is_named(exact: Rows, row: int, column: int, value: float) -> None:
     theta = exact.theta.copy()
     theta[row, column] = value
-    said = f"'{NAMES[column]}' is not on row {row}"
-    with pytest.raises(ValueError, match=said):
+    stated = f"'{NAMES[column]}' is not on row {row}"
+    with pytest.raises(ValueError, match=stated):
         Rows(theta, exact.target, exact.coef).problem()

@@ -46,7 +46,7 @@ def test_a_trajectory_keeps_its_point_as_finite_numbers() -> None:
     missing = np.zeros((40, 2), dtype=bool)
     missing[3, 0] = True
     lacking = replace(run, missing=missing)
-    for part in (run.window(3, 9), lacking.complete(), *run.stretches()):
+    for part in (run.window(3, 9), lacking.complete(), *run.segments()):
         assert (part.parameters, part.units) == (run.parameters, run.units)
     assert "Trajectory at V_D_V=0.3, mdot_mg_s=5, k=3: 40 samples" in repr(run)
 
@@ -141,7 +141,7 @@ def test_files_say_their_points_in_columns_scalars_and_attributes(here: Path) ->
         ({"states": ["q"]}, r"^a.csv: unknown variables \['q'\]"),
         ({}, "^a.csv: a state must vary: 'V' stays at 300"),
         ({"files": ["a.csv", Path("../here/a.csv")]}, "every file may come once: .*a.csv comes ag"),
-        ({"files": "a{x}.csv"}, "^a1.csv: a parameter needs a name that no variable has: 'x'"),
+        ({"files": "a{x}.csv"}, "^a1.csv: a parameter needs a name that no variable has, got 'x'"),
         ({"files": "field.nc", "states": ["n_i"]}, "^field.nc: a field over z needs a zone"),
     ],
 )

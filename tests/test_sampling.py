@@ -13,9 +13,9 @@ EVERY_ROW = ep.Weak(split=ep.regression.RandomSplit(0.0))
 RANDOM = np.cumsum(np.random.default_rng(3).exponential(size=400))
 
 
-def thinned(run: ep.Trajectory, rng: np.random.Generator, share: float = 0.7) -> ep.Trajectory:
+def thinned(run: ep.Trajectory, rng: np.random.Generator, fraction: float = 0.7) -> ep.Trajectory:
     """What is left of a trajectory that has lost samples at random."""
-    kept = np.sort(rng.permutation(run.n_samples)[: round(share * run.n_samples)])
+    kept = np.sort(rng.permutation(run.n_samples)[: round(fraction * run.n_samples)])
     return replace(run, t=run.t[kept], states=run.states[kept])
 
 
@@ -72,9 +72,9 @@ def test_windows_never_cross_a_gap() -> None:
         assert problem.trajectories == (run,)
     t = np.arange(200.0).reshape(20, 10) + 40.0 * np.arange(20)[:, None]
     with pytest.raises(ValueError, match="20 samples without a gap: 19 steps are over 10 times"):
-        ep.Trajectory(t.ravel(), np.sin(t).reshape(-1, 1), ["x"]).stretches()
+        ep.Trajectory(t.ravel(), np.sin(t).reshape(-1, 1), ["x"]).segments()
     short = ep.Trajectory(np.arange(8.0), np.sin(np.arange(8.0))[:, None], ["x"])
-    assert short.stretches() == [short]
+    assert short.segments() == [short]
 
 
 def test_residuals_of_the_truth_are_white_where_samples_are_missing() -> None:

@@ -159,7 +159,7 @@ def test_units_change_nothing_but_the_numbers(search: Search) -> None:
     settings = {"rng": np.random.default_rng(0)}
     scaled = pool_supports(noisy_problem(scale), search, Bootstraps(), **settings)[0]
     assert np.array_equal(plain.masks, scaled.masks)
-    assert np.array_equal(plain.share, scaled.share)
+    assert np.array_equal(plain.fraction, scaled.fraction)
 
 
 def test_bootstraps_draw_whole_groups() -> None:
@@ -194,11 +194,11 @@ def test_shares_count_bootstraps() -> None:
         0
     ]
     sizes = pooled.masks.sum(axis=1)
-    assert pooled.share[sizes == 0].tolist() == [1.0]
-    assert pooled.share[sizes == 2].sum() == pytest.approx(1.0)
+    assert pooled.fraction[sizes == 0].tolist() == [1.0]
+    assert pooled.fraction[sizes == 2].sum() == pytest.approx(1.0)
     # The true pair is found unless one of its two terms was culled (a third of the draws).
     truth = (pooled.masks == [True, True, False, False, False, False]).all(axis=1)
-    assert pooled.share[truth][0] == pytest.approx(2 / 3, abs=3 * np.sqrt(2 / 9 / 50))
+    assert pooled.fraction[truth][0] == pytest.approx(2 / 3, abs=3 * np.sqrt(2 / 9 / 50))
     # Where it was at hand, each true term stood in every support of two terms.
     assert pooled.inclusion[2, :2].tolist() == [1.0, 1.0]
     assert pooled.inclusion[2, 2:].max() < 0.5

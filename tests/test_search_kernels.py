@@ -60,16 +60,16 @@ def test_supports_in_any_order_are_fitted_alone() -> None:
             np.testing.assert_allclose(fit, plain, atol=1e-11)
 
 
-@pytest.mark.parametrize("share", [0.5, 2.0])
-def test_all_routes_of_least_squares_have_one_rule_of_rank(share: float) -> None:
+@pytest.mark.parametrize("fraction", [0.5, 2.0])
+def test_all_routes_of_least_squares_have_one_rule_of_rank(fraction: float) -> None:
     """A column leaves half of the threshold, or twice; the rows, the Gram matrix and the kernel."""
     basis = np.linalg.qr(np.random.default_rng(3).normal(size=(40, 5)))[0]
     theta, target = basis[:, :4] * [1.0, 1e5, 1.0, 1e-7], basis @ np.arange(1.0, 6.0)
-    theta[:, 3] = (basis[:, :2] @ [0.6, 0.8] + np.sqrt(share * DEPENDENT) * basis[:, 3]) * 1e-7
+    theta[:, 3] = (basis[:, :2] @ [0.6, 0.8] + np.sqrt(fraction * DEPENDENT) * basis[:, 3]) * 1e-7
     xx, xy = theta.T @ theta, theta.T @ target
     rows = LeastSquares.of_rows(theta, target)
     (kernel,) = fit_masks(xx, xy, np.ones((1, 4), dtype=bool))
-    if share > 1.0:
+    if fraction > 1.0:
         assert rows.is_determined
         assert rows.rank == 4
         for coef in (kernel, invert_gram(xx) @ xy):  # the Gram matrix has 5 digits left
@@ -131,7 +131,7 @@ def test_masks_are_pooled_as_sets(n_terms: int) -> None:
     of_draws = [{tuple(m) for m in masks[a:b].tolist()} for a, b in pairwise([0, *ends.tolist()])]
     pooled = sorted(set().union(*of_draws), key=lambda m: (sum(m), m))
     assert [tuple(m) for m in supports.masks.tolist()] == pooled
-    assert supports.share.tolist() == [np.mean([m in draw for draw in of_draws]) for m in pooled]
+    assert supports.fraction.tolist() == [np.mean([m in draw for draw in of_draws]) for m in pooled]
     for size in range(n_terms + 1):
         for j in range(n_terms):
             found = [any(m[j] and sum(m) == size for m in draw) for draw in of_draws]

@@ -22,7 +22,7 @@ def front_of(errors: list[float], n_library: int) -> ParetoFront:
             coef=np.ones(k),
             r2_train=1.0 - error,
             r2_test=1.0 - error,
-            share=1.0,
+            fraction=1.0,
             inclusion=np.ones(k),
         )
         for k, error in enumerate(errors)
@@ -101,7 +101,7 @@ def fronts_from(problem: RegressionRows) -> list[ParetoFront]:
     return [pareto_front(problem, supports) for supports in pooled]
 
 
-def misfit(front: ParetoFront) -> np.ndarray:
+def lack_of_fit(front: ParetoFront) -> np.ndarray:
     """n log(RSS / n) of every candidate by plain least squares on unscaled rows."""
     problem, found = front.problem, []
     target = problem.target[:, 0]
@@ -121,7 +121,7 @@ def test_criteria_are_their_formulas() -> None:
         (ep.EBIC(gamma=0.5, coarsening=None), k * np.log(60) + ways),
     ):
         (scores,) = rule.decide([front]).scores
-        expected = misfit(front) + penalty
+        expected = lack_of_fit(front) + penalty
         # Up to a constant, since scores are of scaled targets.
         assert np.diff(scores) == pytest.approx(np.diff(expected), rel=1e-9)
 
@@ -131,7 +131,7 @@ def test_coarsening_counts_fewer_rows() -> None:
     n = 60 / (1 + 60 / 40)
     ways = np.array([log_supports(front.problem.library, c.terms) for c in front.candidates])
     (scores,) = ep.EBIC(coarsening=40.0).decide([front]).scores
-    expected = n / 60 * misfit(front) + front.sizes * np.log(n) + 2 * ways
+    expected = n / 60 * lack_of_fit(front) + front.sizes * np.log(n) + 2 * ways
     assert np.diff(scores) == pytest.approx(np.diff(expected), rel=1e-9)
 
 

@@ -1,4 +1,4 @@
-"""What sensors do to records: limits in place of values, channels that come late, noise that is not
+"""What sensors do to records: limits in place of values, delayed channels, noise that is not
 as assumed, states and samples that come twice."""
 
 from __future__ import annotations
@@ -81,9 +81,11 @@ def test_residuals_beside_limits_are_the_slope_of_what_is_least() -> None:
     here = observe(record, path, variance)
     up, down = (observe(record, path + sign * small, variance).squares for sign in (1.0, -1.0))
     slope = np.nan_to_num(-2.0 * here.residuals / here.variance)
-    told = np.isfinite(here.residuals)
-    assert 0 < (told & record.limits.at).sum() < record.limits.at.sum()
-    np.testing.assert_allclose(slope[told], ((up - down) / (2 * small))[told], rtol=1e-4, atol=1e-5)
+    stated = np.isfinite(here.residuals)
+    assert 0 < (stated & record.limits.at).sum() < record.limits.at.sum()
+    np.testing.assert_allclose(
+        slope[stated], ((up - down) / (2 * small))[stated], rtol=1e-4, atol=1e-5
+    )
 
 
 def test_a_clipped_top_is_found_and_values_beside_it_stay() -> None:
@@ -141,7 +143,7 @@ def test_samples_at_their_limits_do_not_lead_astray(kind: str) -> None:
     system, run = spoilt("van_der_pol", kind, 0, 0.02)
     found = ep.discover(run, system.model.library)
     np.testing.assert_array_equal(found.model.coef != 0.0, system.model.coef != 0.0)
-    assert not found.misfit
+    assert not found.lack_of_fit
     assert any("read as limits, not as values" in each for each in found.remarks)
     std = np.sqrt(np.diag(found.model.covariance))  # type: ignore[arg-type]
     used = system.model.coef.T != 0.0
@@ -219,11 +221,11 @@ def test_a_late_channel_is_said_and_brought_forward_on_request() -> None:
     system, run = spoilt("lotka_volterra", "lag 2", 0, 0.02)
     run = run.window(0, 500)
     found = ep.discover(run, system.model.library)
-    assert found.misfit.startswith("y comes ")
+    assert found.lack_of_fit.startswith("y lags ")
     assert found.model.covariance is None
     aligned = ep.discover(run, system.model.library, ep.TrajectorySearch(align=True))
     np.testing.assert_array_equal(aligned.model.coef != 0.0, system.model.coef != 0.0)
-    assert not aligned.misfit
+    assert not aligned.lack_of_fit
     assert aligned.estimate is not None
     assert aligned.estimate.delays_s[1] == pytest.approx(2.0 * run.dt_s, rel=0.05)
     assert "brought together with the others" in aligned.remarks[0]
@@ -267,9 +269,9 @@ def test_white_and_normal_noise_is_not_spoken_of(name: str) -> None:
 def test_a_state_that_is_another_one_is_refused() -> None:
     run = ep.lotka_volterra().trajectory(noise=0.02, rng=0)
     x, y = run.states.T
-    for third, said in ((x, "z is 1 x at"), (1.0 - 2.0 * y, r"z is -2 y \+1 at")):
+    for third, stated in ((x, "z is 1 x at"), (1.0 - 2.0 * y, r"z is -2 y \+1 at")):
         twice = ep.Trajectory(run.t, np.column_stack([x, y, third]), ["x", "y", "z"])
-        with pytest.raises(ValueError, match=f"states must differ: {said}.*leave z out"):
+        with pytest.raises(ValueError, match=f"states must differ: {stated}.*leave z out"):
             ep.discover(twice)
     nearly = ep.Trajectory(run.t, np.column_stack([x, y, x + 1e-4 * y]), ["x", "y", "z"])
     check_repeats([nearly])

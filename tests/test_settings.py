@@ -1,4 +1,4 @@
-"""Settings of the wrong kind are refused where they are given, with the way out."""
+"""Settings of the wrong kind are refused where they are given, with a hint."""
 
 from collections.abc import Callable
 
@@ -24,7 +24,7 @@ TEXTS = {
     "variables": lambda: ep.polynomial("xy", degree=1),
     "names": lambda: ep.named_terms(["x", "y"], "xy"),
     "states": lambda: ep.discovery.PointSearch("xy", LIBRARY, ROWS),
-    "judged": lambda: ep.FreeRunScore(judged="x"),
+    "assessed": lambda: ep.FreeRunScore(assessed="x"),
     "exact_inputs": lambda: ep.Weak(exact_inputs="u"),
     "state_names": lambda: ep.Trajectory(T, X, "xy"),
     "input_names": lambda: ep.Trajectory(T, X[:, :1], ["x"], X[:, 1:], "u"),
@@ -66,7 +66,7 @@ NO_COUNTS: dict[str, Callable[[object], object]] = {
 def test_what_is_no_whole_number_is_refused(name: str, count: object) -> None:
     if count is None and name.strip() == "max_terms":
         return  # of some searches, all terms
-    message = f"^{name.strip()} must be a whole number, (zero|one|two) or more: {count!r} came$"
+    message = f"^{name.strip()} must be a whole number, (zero|one|two) or more, got {count!r}$"
     with pytest.raises(ValueError, match=message):
         NO_COUNTS[name](count)
 

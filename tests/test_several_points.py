@@ -169,8 +169,8 @@ def test_a_term_that_some_points_cannot_show_is_found() -> None:
     assert models["p=3"] == pytest.approx({"a": 2.0, "b": -0.5}, abs=0.05)
     assert models["p=1"]["b"] == pytest.approx(0.0, abs=0.05)
     assert list(models["p=2"]) == ["a"]
-    (said,) = found.points["p=2"].ambiguities
-    assert said.message == "'b' is zero on every row and is left out"
+    (stated,) = found.points["p=2"].ambiguities
+    assert stated.message == "'b' is zero on every row and is left out"
     assert found.points["p=3"].ambiguities == ()
     for p in (1.0, 2.0):
         assert terms_in(searched({p: rows[p]})) == ("a",)
@@ -329,8 +329,8 @@ def test_the_functions_of_a_law_are_found(bend: Mapping[str, str], functions: se
     assert set(law.functions.names) >= functions
     if bend:
         assert set(law.functions.names) == functions
-        told = searched(rows, law=[1, ep.named_terms(["p"], sorted(functions))]).law
-        assert set(told.functions.names) == functions
+        stated = searched(rows, law=[1, ep.named_terms(["p"], sorted(functions))]).law
+        assert set(stated.functions.names) == functions
     one = searched(rows, law=[1, 2, 3]).law
     assert len(one.functions) == {"1/p": 4, "p^2": 3}.get(bend.get("b", ""), 2)
     straight = searched(rows, law=1).law.left_out

@@ -11,8 +11,8 @@ from ep2sindy.data.sampling import ZoneAverage, side_by_side
 from ep2sindy.library.equations import equation_html, latex_derivative, latex_term_name
 from ep2sindy.library.names import check_state
 from ep2sindy.library.relations import parse_relation
-from ep2sindy.library.roles import constraint_of, shares_of
-from ep2sindy.studies.processes import Zones, compared_processes, told_roles
+from ep2sindy.library.roles import constraint_of, fractions_of
+from ep2sindy.studies.processes import Zones, compared_processes, stated_roles
 from tests.models import model_of
 from tests.programs import composed, computed
 
@@ -51,8 +51,8 @@ def test_every_zone_has_its_own_average(field, zones, run) -> None:
 def test_the_averages_of_all_zones_make_that_of_the_channel(field, zones, run) -> None:
     sizes = ZoneAverage(STATES, zones=zones).sizes(field)
     whole = ep.zone_average(field, ep.Zone(z="channel"), states=STATES)
-    share = np.array([*sizes.values()]) / sum(sizes.values())
-    assert share @ run.states[:, ::2].T == pytest.approx(whole.states[:, 0], rel=1e-6)
+    fraction = np.array([*sizes.values()]) / sum(sizes.values())
+    assert fraction @ run.states[:, ::2].T == pytest.approx(whole.states[:, 0], rel=1e-6)
 
 
 def test_a_grid_point_on_a_shared_edge_belongs_to_the_first_zone() -> None:
@@ -167,7 +167,7 @@ def chain() -> ep.Trajectory:
 
 
 def refined(depth: int) -> ep.Regression:
-    """A search whose systems are refined and judged whole."""
+    """A search whose systems are refined and assessed whole."""
     search = ep.BestSubset(max_terms=6, n_best=100)
     return ep.Regression(search=search, selection=ep.FreeRunScore(bounds=None), depth=depth)
 
@@ -215,16 +215,16 @@ def test_processes_of_zones_stand_beside_what_the_record_exchanged(field, zones,
     balances = {name: ep.thruster.zone_balance(field, zone) for name, zone in parts.items()}
     sizes = ZoneAverage(STATES, zones=zones).sizes(field)
     roles = ROLES.in_zones(sizes).with_known(
-        {k: dict(v.terms) for k, v in told_roles(balances, run).items()}
+        {k: dict(v.terms) for k, v in stated_roles(balances, run).items()}
     )
     library = ep.polynomial(run.state_names, degree=3)
     chosen = {p.role: p for p in roles.processes(library, run.state_names)}  # the last of each
-    held = constraint_of(library, run.state_names, [*chosen.values()], roles.told)
+    held = constraint_of(library, run.state_names, [*chosen.values()], roles.stated)
     assert held is not None
     rates = 1e23 * np.arange(1.0, 7.0)
     theta = library.evaluate(run.states)
     means = [theta[:, library.index(p.term)].mean() for p in chosen.values()]
-    values = held.coef(shares_of(held) @ (rates / means))
+    values = held.coef(fractions_of(held) @ (rates / means))
     coef = np.zeros((len(library), 4))
     for (state, term), value in zip(held.coefficients, values, strict=True):
         coef[library.index(term), run.state_names.index(state)] = value
@@ -232,9 +232,9 @@ def test_processes_of_zones_stand_beside_what_the_record_exchanged(field, zones,
     found = {p.name: p for p in compared_processes(model, held, run, Zones(balances, sizes))}
     assert [p.modelled.mean() for p in found.values()][1:] == pytest.approx(rates)
     whole = ep.thruster.zone_balance(field, ep.Zone(z="channel"))
-    share = sum(sizes.values()) / sizes["exit"]
+    fraction = sum(sizes.values()) / sizes["exit"]
     for name, term in (("ions that leave", "exit_i"), ("neutrals that leave", "exit_n")):
-        assert found[name].recorded == pytest.approx(share * whole[term].values, rel=1e-3)
+        assert found[name].recorded == pytest.approx(fraction * whole[term].values, rel=1e-3)
     inner = balances["anode"]["exit_n"].values
     assert found["neutrals from anode to exit"].recorded == pytest.approx(inner)
     assert found["neutrals that enter"].recorded.mean() == pytest.approx(
@@ -251,14 +251,14 @@ def test_processes_of_zones_stand_beside_what_the_record_exchanged(field, zones,
 def model_record(found, balances, sizes) -> dict[str, xr.Dataset]:
     """Balances of the zones `anode` and `exit` in which every process is the model's own."""
     rate = {each.ends: each.modelled for each in found.values()}
-    share, made = sizes["anode"] / sizes["exit"], {}
+    fraction, made = sizes["anode"] / sizes["exit"], {}
     for zone, balance in balances.items():
         exchanged = rate[f"n_n@{zone}", f"n_i@{zone}"]
         made[zone] = balance.assign(ionization=balance["returned"] + exchanged)
         for state, key in (("n_i", "exit_i"), ("n_n", "exit_n")):
             gone = rate[f"{state}@anode", f"{state}@exit"]
             if zone == "exit":
-                gone = rate[f"{state}@exit", ""] - share * gone
+                gone = rate[f"{state}@exit", ""] - fraction * gone
             made[zone][key] = ("time", gone)
     made["anode"]["supply"] = ("time", rate["", "n_n@anode"])
     return made
@@ -279,7 +279,7 @@ def toy(output: Path) -> list[str]:
     return [
         "+exp=zones", "data=file", f"data.path={output}/chain.nc", f"output={output}",
         "trajectory.zones={a: [0.0, 0.01], b: [0.01, 0.03]}", "data.z.name=z", "bootstraps.n=4",
-        "living.search.max_terms=7", "living.depth=2", "rollout_s=null",
+        "sustained.search.max_terms=7", "sustained.depth=2", "rollout_s=null",
     ]  # fmt: skip
 
 
@@ -287,10 +287,10 @@ def test_the_experiment_reports_zones_and_their_processes(tmp_path: Path) -> Non
     record = chain()
     found = computed(composed(*toy(tmp_path)))
     assert found.summary["data"]["variables"] == NAMES
-    living = found.summary["models"]["zones_living"]["equations"]
-    taken = living["n_i@a"]["n_i@a"]
-    assert living["n_i@b"]["n_i@a"] == pytest.approx(-taken / 2, rel=1e-6)
-    assert living["n_n@a"]["1"] == pytest.approx(1.2e24, rel=0.01)  # free in a file
+    sustained = found.summary["models"]["zones_living"]["equations"]
+    taken = sustained["n_i@a"]["n_i@a"]
+    assert sustained["n_i@b"]["n_i@a"] == pytest.approx(-taken / 2, rel=1e-6)
+    assert sustained["n_n@a"]["1"] == pytest.approx(1.2e24, rel=0.01)  # free in a file
     processes = {each["process"]: each for each in found.summary["balance_zones"]}
     assert {each["recorded"] for each in processes.values()} == {None}  # densities alone
     assert processes["neutrals from a to b"]["modelled"] == pytest.approx(

@@ -180,7 +180,7 @@ def test_predictions_take_samples_one_or_many_and_trajectories() -> None:
     np.testing.assert_allclose(linear().predict([1.0, 2.0]), A @ [1.0, 2.0])
     with pytest.raises(ValueError, match="a Trajectory brings its own inputs"):
         model.predict(run, {"u": u, "w": w})
-    with pytest.raises(ValueError, match=r"a column for each of \['x', 'y'\]: shape \(7, 1\)"):
+    with pytest.raises(ValueError, match=r"a column for each of \['x', 'y'\], got shape \(7, 1\)"):
         linear().predict(x[:, None])
     with pytest.raises(ValueError, match="must be samples here, got a function"):
         model.predict(x[:, None], {"u": np.sin, "w": w})

@@ -86,7 +86,7 @@ def test_one_start_or_equal_errors_tell_nothing() -> None:
 
 @pytest.mark.parametrize("overlap", [1, 5, 10])
 def test_correlated_starts_are_allowed_for(overlap) -> None:
-    """Overlapping forecasts share what moves them. Without a gain, chance exceeds its standard
+    """Overlapping forecasts fraction what moves them. Without a gain, chance exceeds its standard
     error in one case of six, and is sure in one of twenty.
     """
     rng, n, n_cases = np.random.default_rng(overlap), 40, 1000
@@ -96,9 +96,9 @@ def test_correlated_starts_are_allowed_for(overlap) -> None:
         for _ in range(n_cases)
     ]
     for level in (EXCEEDS, SURE):
-        share = np.mean([found._exceeds(gain, -1, level) for gain in gains])
-        # Two standard deviations of such a share, and a quarter of it for what few waves miss.
-        assert share == pytest.approx(1.0 - level, abs=0.025 + 0.25 * (1.0 - level))
+        fraction = np.mean([found._exceeds(gain, -1, level) for gain in gains])
+        # Two standard deviations of such a fraction, and a quarter of it for what few waves miss.
+        assert fraction == pytest.approx(1.0 - level, abs=0.025 + 0.25 * (1.0 - level))
 
 
 def test_a_standard_error_is_that_of_the_mean() -> None:

@@ -83,12 +83,12 @@ def test_the_dense_output_is_of_seventh_order() -> None:
         t, *_ = kernels._step(parts, scheme, 0.0, step_s, 9.0, y, at, slopes, columns, 1.0)
         assert t == step_s
         kernels._polynomial(parts, scheme, 0.0, step_s, y, at, slopes, room, columns, shape)
-        shares = np.linspace(0.1, 0.9, 9)
+        fractions = np.linspace(0.1, 0.9, 9)
         paths = []
-        for share in shares:
-            kernels._between(shape, y, share, room)
+        for fraction in fractions:
+            kernels._between(shape, y, fraction, room)
             paths.append(room.copy())
-        angle = shares * step_s
+        angle = fractions * step_s
         truth = np.column_stack([np.cos(angle), -np.sin(angle)])
         errors.append(np.abs(np.array(paths) - truth).max())
     assert errors[0] > 2.0**7 * errors[1]

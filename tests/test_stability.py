@@ -12,9 +12,9 @@ from ep2sindy.model.fixed_point import rest_point
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.stability import (
     LimitCycle,
+    basin_stability,
     limit_cycle,
     periods_to_reach,
-    share_reaching,
 )
 from tests.models import model_of
 
@@ -74,7 +74,7 @@ def test_hopf_normal_form_has_its_exact_cycle() -> None:
     np.testing.assert_allclose(np.diff(phase), 2.0 * np.pi / 128, atol=SOLVED)
     np.testing.assert_allclose(cycle.multipliers, [1.0, np.exp(-4.0 * np.pi)], atol=SOLVED)
     assert cycle.stability == "attracting"
-    assert share_reaching(model, cycle, n_periods=FEW) == 1.0
+    assert basin_stability(model, cycle, n_periods=FEW) == 1.0
 
 
 @pytest.mark.parametrize("start", [[1.0, 0.0], [1.05, 0.05], [0.9, 0.1]])
@@ -87,7 +87,7 @@ def test_hopf_normal_form_in_reversed_time_repels(start: list[float]) -> None:
     assert turning < 0.0  # clockwise: samples run forwards in time
     assert cycle.multipliers[1] == pytest.approx(np.exp(4.0 * np.pi), rel=1e-4)
     assert cycle.stability == "repelling"
-    assert share_reaching(model, cycle, n_periods=FEW) == 0.0
+    assert basin_stability(model, cycle, n_periods=FEW) == 0.0
 
 
 def test_van_der_pol_has_its_tabulated_period_and_liouvilles_multiplier() -> None:
@@ -95,7 +95,7 @@ def test_van_der_pol_has_its_tabulated_period_and_liouvilles_multiplier() -> Non
     assert cycle.period_s == pytest.approx(6.6632868593231301, rel=SOLVED)
     assert cycle.multipliers[1] == pytest.approx(liouville(model, cycle), abs=SOLVED)
     assert cycle.stability == "attracting"
-    assert share_reaching(model, cycle, n_periods=FEW) == 1.0
+    assert basin_stability(model, cycle, n_periods=FEW) == 1.0
 
 
 def test_neutral_cycles_of_predator_and_prey_are_found_next_to_the_start() -> None:
@@ -108,7 +108,7 @@ def test_neutral_cycles_of_predator_and_prey_are_found_next_to_the_start() -> No
     assert conserved[0] == pytest.approx(1.5 - 2.0 / 3.0 * np.log(0.5), rel=0.01)
     # Means over a closed orbit are those of the fixed point, whatever its size.
     np.testing.assert_allclose(cycle.states.mean(axis=0), [1 / 3, 2 / 3], rtol=SOLVED)
-    assert share_reaching(model, cycle, n_periods=FEW) < 0.2  # only those that start on it
+    assert basin_stability(model, cycle, n_periods=FEW) < 0.2  # only those that start on it
 
 
 @pytest.mark.parametrize("z", [{"z": -1.0}, {"z": -1.0, "x": 1.0}], ids=["still", "driven"])
@@ -119,7 +119,7 @@ def test_a_third_state_adds_its_own_multiplier(z: dict[str, float]) -> None:
     x, y = cycle.states[:, :2].T
     follows = 0.5 * (x + y) if "x" in z else np.zeros(len(x))  # of z' = x - z, x = cos t
     np.testing.assert_allclose(cycle.states[:, 2], follows, atol=SOLVED)
-    assert share_reaching(model, cycle, n_periods=FEW) == 1.0
+    assert basin_stability(model, cycle, n_periods=FEW) == 1.0
 
 
 def test_the_breathing_mode_attracts_in_si_units() -> None:
@@ -131,8 +131,8 @@ def test_the_breathing_mode_attracts_in_si_units() -> None:
     closing = model.simulate([0.0, cycle.period_s], cycle.states[0], rtol=1e-10).states[-1]
     np.testing.assert_allclose(closing, cycle.states[0], rtol=1e-7)
     # From the other 21 starts neutrals fall below zero, as LSODA finds too, and run away.
-    assert share_reaching(model, cycle) == 43 / 64
-    assert share_reaching(model, cycle, n_periods=FEW, spread=(0.8, 1.25)) == 1.0
+    assert basin_stability(model, cycle) == 43 / 64
+    assert basin_stability(model, cycle, n_periods=FEW, spread=(0.8, 1.25)) == 1.0
 
 
 def test_a_start_far_from_an_attracting_cycle_is_let_run_first() -> None:
@@ -153,7 +153,7 @@ def test_units_change_nothing(equations: Equations) -> None:
     np.testing.assert_allclose(other.multipliers, cycle.multipliers, rtol=1e-4, atol=SOLVED)
     # Rounding moves the state along the flow by what a small tolerance allows.
     np.testing.assert_allclose(other.states / scale, cycle.states, atol=1e-5)
-    assert share_reaching(other_model, other, n_periods=FEW) == share_reaching(
+    assert basin_stability(other_model, other, n_periods=FEW) == basin_stability(
         model, cycle, n_periods=FEW
     )
 
@@ -208,7 +208,7 @@ def test_starts_outside_a_bounded_basin_do_not_reach_the_cycle() -> None:
     model, cycle = found(equations, [1.1, 0.0], 6.0)
     starts = starts_around(cycle.states, 64, (0.3, 3.0))
     inside = np.linalg.norm(starts, axis=1) < 2.0
-    assert share_reaching(model, cycle, n_periods=FEW) == inside.mean()
+    assert basin_stability(model, cycle, n_periods=FEW) == inside.mean()
     assert inside.mean() == pytest.approx(np.pi / 9.0, abs=0.05)  # of a disc in the square
 
 
@@ -240,7 +240,7 @@ def test_fast_relaxation_is_resolved() -> None:
         atol=1e-12,
     )
     assert cycle.period_s == pytest.approx(np.diff(run.t_events[0])[-1], rel=SOLVED)
-    assert share_reaching(model, cycle, n_starts=8, n_periods=10.0, spread=(0.5, 1.5)) == 1.0
+    assert basin_stability(model, cycle, n_starts=8, n_periods=10.0, spread=(0.5, 1.5)) == 1.0
 
 
 @pytest.mark.parametrize(
@@ -259,7 +259,7 @@ def test_a_model_with_inputs_has_no_cycle_of_its_own() -> None:
     with pytest.raises(ValueError, match=r"without inputs: this one has \['u'\]"):
         limit_cycle(model, np.ones(2), period_s=1.0)
     with pytest.raises(ValueError, match="without inputs"):
-        share_reaching(model, cycle, n_periods=FEW)
+        basin_stability(model, cycle, n_periods=FEW)
 
 
 @pytest.mark.parametrize(
@@ -279,16 +279,16 @@ def test_a_search_needs_a_state_a_period_and_samples(
 
 def test_starts_that_cannot_be_and_a_cycle_of_another_model_are_refused() -> None:
     model, cycle = found(HOPF, [1.0, 0.0], 6.0)
-    with pytest.raises(ValueError, match=r"got n_periods=3.0"):
-        share_reaching(model, cycle, n_periods=3.0)
+    with pytest.raises(ValueError, match=r"n_periods=3.0"):
+        basin_stability(model, cycle, n_periods=3.0)
     with pytest.raises(ValueError, match="the lower first"):
-        share_reaching(model, cycle, spread=(3.0, 0.3))
+        basin_stability(model, cycle, spread=(3.0, 0.3))
     with pytest.raises(ValueError, match="it has 2 states"):
-        share_reaching(model_of({**HOPF, "z": {"z": -1.0}}), cycle)
+        basin_stability(model_of({**HOPF, "z": {"z": -1.0}}), cycle)
 
 
 def test_a_slow_cycle_is_waited_for() -> None:
-    """A cycle whose departures shrink by 2 % in a period is reached, in some hundred periods."""
+    """A cycle whose perturbations shrink by 2 % in a period is reached, in some hundred periods."""
     rate = -np.log(0.98) / (2.0 * 2.0 * np.pi)  # of Hopf's normal form: exp(-2 rate period)
     slow = {
         "x": {"x": rate, "y": -1.0, "x^3": -rate, "x*y^2": -rate},
@@ -297,8 +297,8 @@ def test_a_slow_cycle_is_waited_for() -> None:
     model, cycle = found(slow, [1.0, 0.0], 2.0 * np.pi)
     assert cycle.largest_multiplier == pytest.approx(0.98, abs=1e-6)
     assert periods_to_reach(cycle) == pytest.approx(-3.0 / np.log(0.98), rel=1e-3)
-    assert share_reaching(model, cycle, n_starts=8, n_periods=40.0) < 1.0
-    assert share_reaching(model, cycle, n_starts=8) == 1.0
+    assert basin_stability(model, cycle, n_starts=8, n_periods=40.0) < 1.0
+    assert basin_stability(model, cycle, n_starts=8) == 1.0
 
 
 def test_a_living_cycle_says_where_its_model_rests() -> None:

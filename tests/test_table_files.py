@@ -40,9 +40,9 @@ def write_indexed_parquet(path: Path) -> None:
 
 
 def write_tdms(path: Path) -> None:
-    said = {"wf_increment": 1.5e-6, "unit_string": "mA"}
+    stated = {"wf_increment": 1.5e-6, "unit_string": "mA"}
     with TdmsWriter(path) as writer:
-        writer.write_segment([ChannelObject("Probes", "I_d", X, properties=said)])
+        writer.write_segment([ChannelObject("Probes", "I_d", X, properties=stated)])
 
 
 def write_tdms_of_named_units(path: Path) -> None:

@@ -201,7 +201,7 @@ def test_rounded_times_take_the_step_of_the_preamble(tmp_path: Path) -> None:
 
 def test_stretches_that_a_file_joins_are_not_made_even(tmp_path: Path) -> None:
     path = tektronix(tmp_path / "a.csv", np.concatenate([T[:15], T[:15]]))
-    with pytest.raises(ValueError, match="give dt_s if the steps are equal, or the stretches as"):
+    with pytest.raises(ValueError, match="give dt_s if the steps are equal, or the segments as"):
         ep.open_field(path)
 
 

@@ -16,7 +16,7 @@ from ep2sindy.thruster.magnetic_field import MagneticField
 from ep2sindy.thruster.parameters import OPERATING_POINTS, OperatingPoint, Thruster
 from ep2sindy.thruster.propellants import XenonFits
 from ep2sindy.thruster.transport import AnomalousTransport
-from ep2sindy.thruster.verdict import judge_status
+from ep2sindy.thruster.verdict import assess_status
 
 NOMINAL = OperatingPoint(300.0, 5.0)
 
@@ -132,7 +132,7 @@ def test_diverged_run_comes_back_marked_and_finite(sample_s, n_samples):
 def test_verdict_follows_the_late_amplitude(growth_per_record, level, verdict):
     t = np.linspace(0.0, 1.0, 4000)
     current = 4.0 + level * np.exp(growth_per_record * (t - 0.7)) * np.sin(200.0 * np.pi * t)
-    assert judge_status(current, sample_s=float(t[1])) == verdict
+    assert assess_status(current, sample_s=float(t[1])) == verdict
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""A thruster from a file: the group of configs, and what is said of one that cannot be."""
+"""A thruster from a file: the group of configs, and what holds for one that cannot be."""
 
 from pathlib import Path
 

@@ -26,7 +26,7 @@ def toda(n_periods=20.0, *, per_period=80, start=(0.3, 0.0)):
     library = ep.polynomial(["x", "g"], degree=2)
     coef = ep.model.coef_matrix(library, [{"x*g": 1.0}, {"1": A, "x": -B}])
     model = ep.SparseModel(library, ["x", "g"], coef)
-    # The period of small departures; those of large ones are longer.
+    # The period of small perturbations; those of large ones are longer.
     t = 2 * np.pi / np.sqrt(A) * np.arange(round(n_periods * per_period)) / per_period
     return model.simulate(t, list(start))
 
@@ -202,12 +202,12 @@ def test_a_smoother_follows_pulses_and_few_samples_to_a_period():
     assert signal_memory_s(t, noise, kept=0.99) == t[-1]
 
 
-@pytest.mark.parametrize("share", [0.02, 0.05, 0.2])
-def test_a_gap_does_not_change_the_frequency(share):
+@pytest.mark.parametrize("fraction", [0.02, 0.05, 0.2])
+def test_a_gap_does_not_change_the_frequency(fraction):
     rng = np.random.default_rng(3)
     t = 1.5e-6 * np.arange(3000)
     x = np.exp(2.0 * np.sin(2 * np.pi * 2e4 * t)) * (1.0 + 0.2 * rng.standard_normal(3000))
-    gap = slice(1000, 1000 + round(3000 * share))
+    gap = slice(1000, 1000 + round(3000 * fraction))
     kept = np.delete(np.arange(3000), gap)
     found = ep.signals.find_cycle(t[kept], x[kept, None])
     assert found.frequency_Hz == pytest.approx(2e4, rel=1e-3)
@@ -245,7 +245,7 @@ def test_signals_of_several_runs_get_one_embedding():
     assert {each.embedding for each in alike([high, high])} == {Embedding("rate")}
     both = alike([high, low], n_states=3)
     assert {each.embedding for each in both} == {Embedding("derivative", n_states=3)}
-    with pytest.raises(ValueError, match="a signal or more: an empty list"):
+    with pytest.raises(ValueError, match="a signal or more, got an empty list"):
         alike([])
 
 
@@ -346,7 +346,7 @@ def test_hidden_states_that_explain_a_signal_end_the_list() -> None:
     exact = {"1": 2 / 9, "x": -2 / 3, "g": -1 / 3, "x*g": 1.0}
     assert attempt.found.model.terms("g") == pytest.approx(exact, rel=0.05)
     assert attempt.searched == ["g"]
-    assert np.isnan(attempt.share)
+    assert np.isnan(attempt.fraction)
     assert free.is_similar
     assert free.record.t[0] == signal.t[round(0.75 * len(signal.t)) - 1]
     assert states.state_names == ("x", "g")

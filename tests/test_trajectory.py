@@ -50,7 +50,7 @@ REPEATED[20] = REPEATED[19]
         ({"inputs": np.ones((50, 1))}, "one name per column"),
         ({"t": np.zeros(1), "states": np.ones((1, 1))}, "at least two samples"),
         ({"states": np.full((50, 1), 2.5)}, "'x' stays at 2.5 over all 50 samples; leave it out"),
-        ({"inputs": np.ones((50, 1)), "input_names": ["x"]}, r"unique: \['x'\]"),
+        ({"inputs": np.ones((50, 1)), "input_names": ["x"]}, r"unique, got \['x'\]"),
     ],
 )
 def test_bad_samples_are_refused_by_name(changes: dict, message: str) -> None:

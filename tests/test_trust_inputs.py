@@ -135,19 +135,19 @@ def test_a_circle_of_groups_is_not_walked_twice(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("error", "said"),
+    ("error", "stated"),
     [
         (AttributeError("'NoneType' object has no attribute 'x'"), "it is damaged, or of another"),
         (OSError("Unable to open file\n(truncated file: eof = 9)."), "Unable to open file (trunca"),
     ],
 )
 def test_a_library_speaks_in_one_line_and_python_does_not(
-    error: Exception, said: str, tmp_path: Path
+    error: Exception, stated: str, tmp_path: Path
 ) -> None:
     words = pytest.raises(ValueError, match="a.nc cannot be read: ")
     with words as caught, damage_named(tmp_path / "a.nc"):
         raise error
-    assert said in str(caught.value)
+    assert stated in str(caught.value)
     assert "\n" not in str(caught.value)
 
 

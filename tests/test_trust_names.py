@@ -89,7 +89,7 @@ class Parsed(HTMLParser):
     def __init__(self, page: str) -> None:
         super().__init__()
         self.tags: list[str] = []
-        self.said = ""
+        self.stated = ""
         self.feed(page)
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
@@ -97,7 +97,7 @@ class Parsed(HTMLParser):
             self.tags += [tag, *(name for name, _ in attrs)]
 
     def handle_data(self, data: str) -> None:
-        self.said += data
+        self.stated += data
 
 
 @pytest.mark.parametrize("text", MARKUP)
@@ -122,6 +122,6 @@ def test_page_and_screen_show_markup_as_it_is(text: str, tmp_path: Path) -> None
 
     found = Parsed(page(text))
     assert text in (tmp_path / "run.log").read_text()
-    assert found.said.count(text) >= 20
+    assert found.stated.count(text) >= 20
     assert found.tags == Parsed(page("word")).tags
     assert found.tags.count("svg") == 1

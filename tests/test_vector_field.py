@@ -1,4 +1,4 @@
-"""Right-hand sides as sums of products: rates, Jacobian, departures, units and entries."""
+"""Right-hand sides as sums of products: rates, Jacobian, perturbations, units and entries."""
 
 import numpy as np
 import pytest
@@ -45,25 +45,25 @@ def test_a_model_without_terms_rests() -> None:
     library = ep.polynomial(["x", "y"], degree=2)
     field = VectorField.of(library, ["x", "y"], np.zeros((len(library), 2)))
     assert not field.rates(points(2)).any()
-    assert not field.with_departures().rates(points(6)).any()
+    assert not field.with_perturbations().rates(points(6)).any()
 
 
 @pytest.mark.parametrize("system", [ep.lorenz(), ep.systems.van_der_pol()])
 def test_departures_follow_the_linearised_equations(system: ep.systems.System) -> None:
     field, d = system.model.field, len(system.model.states)
     values = points(d + d * d)
-    rates = field.with_departures().rates(values)
+    rates = field.with_perturbations().rates(values)
     jacobian = field.jacobian(values[:, :d])
     np.testing.assert_allclose(rates[:, :d], field.rates(values[:, :d]), rtol=1e-14)
-    departures = values[:, d:].reshape(-1, d, d)  # each a row
-    expected = np.einsum("njv,nrv->nrj", jacobian, departures)
+    perturbations = values[:, d:].reshape(-1, d, d)  # each a row
+    expected = np.einsum("njv,nrv->nrj", jacobian, perturbations)
     np.testing.assert_allclose(rates[:, d:], expected.reshape(len(values), -1), rtol=1e-12)
 
 
 def test_departures_of_functions_do_so_too() -> None:
     model = model_of({"x": {"v": 1.0}, "v": {"sin(x)": -4.0}})
     values = points(6)
-    rates = model.field.with_departures().rates(values)
+    rates = model.field.with_perturbations().rates(values)
     np.testing.assert_allclose(rates[:, 3], -4.0 * np.cos(values[:, 0]) * values[:, 2], rtol=1e-13)
 
 

@@ -51,7 +51,7 @@ def test_a_refinement_is_followed_through_few_files() -> None:
     ep.refine(prey.model, [run], window=30, n_windows=4, seed=0)  # imports, and compiles
     entered = files_entered(lambda: ep.refine(prey.model, [run], window=30, n_windows=4, seed=0))
     assert {path for path in entered if path.startswith("refinement/")} == {
-        "refinement/judge.py",
+        "refinement/assess.py",
         "refinement/kernels.py",
         "refinement/methods/multiple_shooting.py",
         "refinement/ode.py",

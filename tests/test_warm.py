@@ -11,7 +11,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from ep2sindy.app import warm
+from ep2sindy.app import precompile
 from ep2sindy.runtime import compilation
 
 
@@ -24,16 +24,16 @@ def compilations(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[bool]:
     """What comes of each compilation, the next one first; the cache lies in `tmp_path`."""
     outcomes = [True, True, True]
     monkeypatch.setenv("EP2SINDY_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(warm, "_compile_all", lambda: None if outcomes.pop(0) else full())
+    monkeypatch.setattr(precompile, "_compile_all", lambda: None if outcomes.pop(0) else full())
     return outcomes
 
 
 def test_kernels_are_compiled_once_and_said_to_be(
     compilations: list[bool], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    warm.warm()
+    precompile.precompile()
     assert capsys.readouterr().err == f"{compilation.ANNOUNCEMENT}\n"
-    warm.warm()
+    precompile.precompile()
     assert capsys.readouterr().err == ""
     assert len(compilations) == 2
 
@@ -43,10 +43,10 @@ def test_kernels_are_compiled_again_where_a_source_has_changed(
 ) -> None:
     source = tmp_path / "my_kernels.py"
     source.write_text("one")
-    monkeypatch.setattr(warm, "sources", lambda: [source])
-    warm.warm()
+    monkeypatch.setattr(precompile, "sources", lambda: [source])
+    precompile.precompile()
     source.write_text("longer")
-    warm.warm()
+    precompile.precompile()
     assert len(compilations) == 1
 
 
@@ -116,10 +116,10 @@ def test_an_administrator_puts_kernels_beside_the_package(
     made, lacking = tmp_path / "cache" / "kernels" / "model_1", tmp_path / "none"
     made.mkdir(parents=True)
     (made / "a.nbi").write_text("index")
-    monkeypatch.setattr(warm, "folders", lambda: [made, lacking])
-    monkeypatch.setattr(warm, "SHARED", tmp_path / "shared")
+    monkeypatch.setattr(precompile, "folders", lambda: [made, lacking])
+    monkeypatch.setattr(precompile, "SHARED", tmp_path / "shared")
     for _ in range(2):
-        warm.main(["--shared"])
+        precompile.main(["--shared"])
         stamp, kernel = sorted((tmp_path / "shared").iterdir(), reverse=True)
         assert stamp.name.startswith("warm_")
         assert (kernel / "a.nbi").read_text() == "index"
@@ -133,8 +133,8 @@ def test_without_a_folder_kernels_are_compiled_every_time_and_it_is_said(kernels
 
 def test_what_was_broken_off_is_taken_up_again(compilations: list[bool]) -> None:
     compilations.insert(0, False)
-    warm.warm()
-    warm.warm()
+    precompile.precompile()
+    precompile.precompile()
     assert len(compilations) == 2
 
 
@@ -142,10 +142,10 @@ def test_a_folder_that_cannot_be_written_costs_no_run(
     compilations: list[bool], tmp_path: Path
 ) -> None:
     (tmp_path / "cache").write_text("a file")
-    warm.warm()
+    precompile.precompile()
     assert len(compilations) == 3
     with pytest.raises(SystemExit, match="error: .*cannot be a cache: "):
-        warm.main([])
+        precompile.main([])
 
 
 def test_a_call_that_compiles_says_so_once(
@@ -157,20 +157,22 @@ def test_a_call_that_compiles_says_so_once(
     assert capsys.readouterr().err == f"{compilation.ANNOUNCEMENT}\n"
 
 
-@pytest.mark.parametrize("part", warm.PARTS)
+@pytest.mark.parametrize("part", precompile.PARTS)
 def test_parts_of_the_package_that_call_kernels_run(part: str) -> None:
-    warm.PARTS[part]()
+    precompile.PARTS[part]()
 
 
 @pytest.mark.slow
 def test_every_kernel_is_compiled_and_then_none_is(tmp_path: Path) -> None:
     """From nothing; and a search, a refinement and a simulation find all that they call."""
     environment = os.environ | {"EP2SINDY_CACHE": str(tmp_path)}
-    command = [sys.executable, "-m", "ep2sindy.app.main", "warm"]
+    command = [sys.executable, "-m", "ep2sindy.app.main", "precompile"]
     run = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
     assert compilation.ANNOUNCEMENT in run.stderr
     kept = {path.name.split("-")[0] for path in tmp_path.rglob("*.nbi")}
-    texts = {path.stem: path.read_text("utf-8").split("\n@compiled")[1:] for path in warm.sources()}
+    texts = {
+        path.stem: path.read_text("utf-8").split("\n@compiled")[1:] for path in precompile.sources()
+    }
     names = {
         f"{stem}.{part.split('def ', 1)[1].split('(', 1)[0]}"
         for stem, parts in texts.items()

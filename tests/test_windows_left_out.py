@@ -258,14 +258,14 @@ def test_a_refinement_that_ends_worse_than_it_began_is_not_kept() -> None:
     better, worse = PREY.model, replace(PREY.model, coef=2.0 * PREY.model.coef)
     refined = BatchRefinement([better, worse], np.zeros(2, dtype=np.bool_), np.ones(2))
     run = PREY.trajectory()
-    batch, fold = batch_of(run), systems.Fold([systems.Stretch(0, 0, 300)], [])
+    batch, fold = batch_of(run), systems.Fold([systems.Segment(0, 0, 300)], [])
     trial = systems.TrialSystem(off, unconstrained(off))
     measure = WindowsLeftOut([run], run.states.std(axis=0), ["x", "y"], 2, 2)
-    mended, spoilt = measure.judge([trial, trial], refined, batch, fold, SILENT)
+    mended, spoilt = measure.assess([trial, trial], refined, batch, fold, SILENT)
     assert np.abs(mended).max() < 1e-3
     same = BatchRefinement([off, off], np.ones(2, dtype=np.bool_), np.ones(2))
     np.testing.assert_array_equal(
-        spoilt, measure.judge([trial, trial], same, batch, fold, SILENT)[1]
+        spoilt, measure.assess([trial, trial], same, batch, fold, SILENT)[1]
     )
 
 

@@ -16,7 +16,7 @@ from ep2sindy.estimation.explanation import explain
 from ep2sindy.estimation.likelihood import Gram, gram
 from ep2sindy.estimation.problem import EstimationProblem, scale_problem
 from ep2sindy.estimation.solver import COMPARED_AT, Solution, from_smooth, refit
-from ep2sindy.estimation.supports import term_prices
+from ep2sindy.estimation.supports import term_penalties
 from ep2sindy.estimation.working_set import first_set
 from ep2sindy.regression import searches
 from ep2sindy.regression.gram_kernels import invert_gram
@@ -127,7 +127,7 @@ def test_a_problem_of_some_terms_keeps_the_prices_of_all() -> None:
     kept = np.arange(len(problem.block)) % 3 == 0
     part = problem.restricted(kept)
     again = part.restricted(np.arange(kept.sum()) % 2 == 0)
-    assert np.array_equal(term_prices(part, 1000.0), term_prices(problem, 1000.0)[kept])
+    assert np.array_equal(term_penalties(part, 1000.0), term_penalties(problem, 1000.0)[kept])
     assert again.candidates is problem
     free = np.random.default_rng(0).standard_normal(kept.sum())
     every = np.zeros(len(kept))
@@ -184,9 +184,9 @@ def test_small_libraries_are_weighed_whole() -> None:
 def exact_gains(pair: Gram, support: np.ndarray) -> np.ndarray:
     """Fall of the quadratic function of all coefficients by each one beside a support."""
     inverse = invert_gram(pair.quadratic[np.ix_(support, support)])
-    share = pair.quadratic[:, support] @ inverse
-    own = np.diag(pair.quadratic) - np.einsum("js,js->j", share, pair.quadratic[:, support])
-    score = pair.linear - share @ pair.linear[support]
+    fraction = pair.quadratic[:, support] @ inverse
+    own = np.diag(pair.quadratic) - np.einsum("js,js->j", fraction, pair.quadratic[:, support])
+    score = pair.linear - fraction @ pair.linear[support]
     return np.where(support, 0.0, np.square(score) / np.where(support, 1.0, own))
 
 
@@ -232,7 +232,7 @@ def test_eight_waves_of_360_coefficients_are_found() -> None:
     system = waves(8)
     run = system.trajectory(noise=0.05, rng=1)
     found = ep.estimate(run, ep.polynomial(run.state_names, degree=2))
-    assert not found.misfit
+    assert not found.lack_of_fit
     for state in run.state_names:
         assert set(found.model.terms(state)) == set(system.model.terms(state))
     np.testing.assert_allclose(
@@ -259,7 +259,7 @@ def test_an_equation_may_have_more_terms_than_seven() -> None:
     ]
     library = ep.polynomial(["x", "y"], degree=5)
     found = ep.estimate(runs, library)
-    assert not found.misfit
+    assert not found.lack_of_fit
     assert set(found.model.terms("y")) == set(system.model.terms("y"))
 
 
@@ -291,5 +291,5 @@ def test_products_do_not_stand_in_for_linear_terms_of_a_transient(noise: float, 
     found = ep.estimate(run, library)
     assert not found.model.coef[library.degrees > 1].any()
     right = ((found.model.coef[1:7].T != 0.0) == (matrix != 0.0)).all()
-    # Six decaying states of one transient look alike: where terms are wrong, it is said.
+    # Six decaying states of one transient look alike: where terms are wrong, it is stated.
     assert right or "samples do not tell these equations from others" in found.too_few_samples

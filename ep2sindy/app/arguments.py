@@ -19,7 +19,7 @@ from ep2sindy.runtime.screen import listed, near_words
 from ep2sindy.trust.user_code import nodes_of
 
 JOBS = "jobs"  # folder of a sweep with a record of each job
-COMMANDS = ("compare", "inspect", "warm")  # that stand first, without +exp=NAME
+COMMANDS = ("compare", "inspect", "precompile")  # that stand first, without +exp=NAME
 # Options of Hydra with a value, and those without one. A run always begins with the package's own
 # config.yaml, so the options that would replace it are not among them.
 VALUED = ("--cfg", "-c", "--package", "-p", "--config-dir")
@@ -94,13 +94,13 @@ def explain(
         return _unreadable(error.override, error.message.strip().partition("\n")[0])
     if isinstance(error, MissingConfigException):
         return _no_choice(error)
-    said = str(error).partition("\nSee https")[0]
-    found = re.match(r"Could not (override|delete from config\.) '?([^'\s]+?)'(?:\.| does)", said)
+    stated = str(error).partition("\nSee https")[0]
+    found = re.match(r"Could not (override|delete from config\.) '?([^'\s]+?)'(?:\.| does)", stated)
     if found is None:
         cause = str(error.__cause__ or "").strip().partition("\n")[0]
-        return ": ".join(filter(None, [said, cause])) + "; --cfg job shows what a config has"
+        return ": ".join(filter(None, [stated, cause])) + "; --cfg job shows what a config has"
     key = found[2]
-    if "No match in the defaults list" in said:
+    if "No match in the defaults list" in stated:
         typed = next((text for text in settings if _key(text) == key), key)
         return f"{typed!r} adds to the config, which needs a plus: write +{typed}"
     try:

@@ -1,7 +1,7 @@
 """The command line: `ep2sindy +exp=breathing`, or `python -m experiments.run +exp=breathing`.
 
 `ep2sindy compare RUN RUN` compares run folders instead. `ep2sindy inspect PATH` inspects files,
-and `ep2sindy warm` compiles, once after installation, all that needs compiling.
+and `ep2sindy precompile` compiles, once after installation, all that needs compiling.
 
 Only Hydra is imported here: `--help` must not wait for the numerics.
 """
@@ -71,8 +71,8 @@ def command(arguments: Sequence[str], conf: Path) -> bool:
         from ep2sindy.app.inspection import main as inspect_files
 
         inspect_files(rest, conf)
-    elif name == "warm":
-        from ep2sindy.app.warm import main as compile_kernels
+    elif name == "precompile":
+        from ep2sindy.app.precompile import main as compile_kernels
 
         compile_kernels(rest)
     return name in COMMANDS

@@ -15,9 +15,9 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 import ep2sindy.studies
+from ep2sindy.app.precompile import precompile
 from ep2sindy.app.schema import keys_of, study_of
 from ep2sindy.app.targets import check_targets
-from ep2sindy.app.warm import warm
 from ep2sindy.report.folder import RunFolder
 from ep2sindy.report.report import Report
 from ep2sindy.report.screen import Screen
@@ -37,7 +37,7 @@ def run_config(config: DictConfig) -> Path:
         advance(1)
         study: Experiment = study_of(kind, config)  # an invalid setting leaves no run folder
         advance(1)
-    warm()
+    precompile()
     with start_run(config) as report:
         study.run(report)
         formats = config.get("formats", ["png"])

@@ -45,7 +45,7 @@ def read_whole(array: xr.DataArray) -> np.ndarray:
     check_memory(
         float(array.nbytes),
         f"{array.name}, of shape {array.shape},",
-        way_out="average over a zone, which is read in parts, or give data.chunks, such as "
+        hint="average over a zone, which is read in parts, or give data.chunks, such as "
         "{time: 1000}",
     )
     return array.values

@@ -28,7 +28,7 @@ from ep2sindy.runtime.values import check_kind, check_list
 
 
 BEYOND = 5.0  # standard deviations of noise by which a sample may lie outside a domain
-NOISY = 1e-9  # share of a signal's range that counts as noise, and not as rounding
+NOISY = 1e-9  # fraction of a signal's range that counts as noise, and not as rounding
 
 
 def check_domain(runs: Sequence[Trajectory], library: Library, *, smooth: bool) -> None:
@@ -110,14 +110,14 @@ SAME = 1e-12  # residual of an exact copy due to rounding, as a fraction of the 
 MIN_SHARED = 8  # consecutive samples; shorter matches of rounded samples can occur by chance
 
 
-def check_repeats(runs: Sequence[Trajectory], *, tied: bool = False) -> None:
+def check_repeats(runs: Sequence[Trajectory], *, coupled: bool = False) -> None:
     """Raise ValueError for repeated states or samples.
 
     A state that equals another one up to scale and offset makes the coefficients arbitrary, unless
     they are tied: two species of a closed reaction have a constant sum. Runs that share samples
     make the confidence intervals too small.
     """
-    if not tied:
+    if not coupled:
         _check_states(runs)
     begin = np.array([run.states[0, 0] for run in runs])
     for i, run in enumerate(runs):
@@ -188,7 +188,7 @@ class Task:
         seen = [name for name in self.library.variables if name not in self.hidden]
         check_agreement(self.runs, seen)
         roles = self.facts.roles
-        check_repeats(self.runs, tied=roles is not None)
+        check_repeats(self.runs, coupled=roles is not None)
         if roles is not None:
             roles.processes(self.library, self.states)
             for state in roles.positive:
@@ -222,8 +222,8 @@ class Task:
             known[0, [library.index(name) for name in facts.only[equation]]] = True
             return [known] * len(found)
         # At another point a coefficient may be another number than zero: its term is in.
-        told = [Relation(((1.0, *place),), 1.0, "") for place in facts.known_factors]
-        relations = [*facts.relations, *told]
+        stated = [Relation(((1.0, *place),), 1.0, "") for place in facts.known_factors]
+        relations = [*facts.relations, *stated]
         return [complete(masks, library, equation, relations) for masks in found]
 
     def _check_hidden(self) -> None:

@@ -15,10 +15,10 @@ if TYPE_CHECKING:
 
 # Longest step, in median steps, that is interpolated; a longer one is a gap. Random times have
 # such a gap once in 1000 samples, random losses of 30 % never. With a limit of 5, random times are
-# divided into stretches of about 30 samples, and Lorenz was never found.
+# divided into segments of about 30 samples, and Lorenz was never found.
 LONGEST_STEP = 10.0
 
-MIN_STRETCH = 20  # samples between gaps: fewer determine neither their noise nor a derivative
+MIN_SEGMENT = 20  # samples between gaps: fewer determine neither their noise nor a derivative
 
 
 class MissingSamples(UserWarning):
@@ -69,7 +69,7 @@ def usual_step(t: Float[np.ndarray, " samples"]) -> float:
 
 
 def between_gaps(t: Float[np.ndarray, " samples"]) -> list[tuple[int, int]]:
-    """First and last sample (exclusive) of every stretch of times without a gap.
+    """First and last sample (exclusive) of every segment of times without a gap.
 
     A gap is a step that is long beside the median step, and beside a step next to it: times that
     grow by a factor from one to the next have long steps, and no gap.

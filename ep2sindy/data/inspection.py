@@ -163,7 +163,7 @@ class Inspection:
         return [text for text in texts if text]
 
     def _words_of_arrays(self) -> dict[str, list[str]]:
-        """What is said of each array, but for its range."""
+        """The description of each array, but for its range."""
         n = self.n_samples
         return {
             one.name: [
@@ -194,9 +194,9 @@ class Inspection:
             step = f", {about}{one.step:.4g} apart" if one.step else ""
             role = ", ".join(self._roles.get(one.name, ["-"])) + step
             span = [f"{one.low:.4g}", f"{one.high:.4g}", str(one.n_missing or "")]
-            said = [f"({', '.join(map(str, one.shape))})", one.unit, *span, role]
+            stated = [f"({', '.join(map(str, one.shape))})", one.unit, *span, role]
             unused = [*[""] * 5, TEXT if one.problem == TEXT else "left out"]
-            rows.append([one.name, *(unused if one.problem else said)])
+            rows.append([one.name, *(unused if one.problem else stated)])
         return rows
 
     @cached_property

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 # above the second a square overflows. Terms that overflow raise their own error.
 LEAST, MOST = 1e-50, 1e150
 
-# Times the noise, and share of the RMS, by which a state that is nonnegative may lie below zero.
+# Times the noise, and fraction of the RMS, by which a state that is nonnegative may lie below zero.
 BELOW_NOISE, BELOW_ZERO = 6.0, 0.05
 
 
@@ -37,8 +37,8 @@ def real_numbers(values: object, what: str) -> np.ndarray:
             "b": "give 0.0 and 1.0 if they are meant as numbers",
             "O": "convert them first, .astype(float)",
         }
-        way_out = ways.get(array.dtype.kind, "convert them first")
-        raise ValueError(f"{what} must hold real numbers, got {array.dtype}; {way_out}")
+        hint = ways.get(array.dtype.kind, "convert them first")
+        raise ValueError(f"{what} must hold real numbers, got {array.dtype}; {hint}")
     copy = np.array(array, dtype=np.float64, order="C")
     if masked is not None:
         copy[np.ma.getmaskarray(masked)] = np.nan
@@ -180,7 +180,7 @@ def least_squares(
 ) -> Float[np.ndarray, " columns"]:
     """Least squares of columns in any units, each of which is scaled to unit norm.
 
-    cutoff: singular values below this share of the largest count as zero; None for rounding.
+    cutoff: singular values below this fraction of the largest count as zero; None for rounding.
     """
     size = column_norms(columns)
     return np.linalg.lstsq(columns / size, target, rcond=cutoff)[0] / size
@@ -214,7 +214,7 @@ def least_beside_grid(
 def quantiles(draws: Float[np.ndarray, "draws ..."], levels: Sequence[float]) -> np.ndarray:
     """Quantiles over the draws that are finite; NaN where none is.
 
-    Between two draws of n lies the share 1 / (n + 1) of all others, so bands hold what they say.
+    Between two draws of n lies the fraction 1 / (n + 1) of all others, so bands hold what they say.
     """
     # Sorted along the last axis, which is many times as fast as np.nanquantile.
     ordered = np.sort(np.moveaxis(np.where(np.isfinite(draws), draws, np.nan), 0, -1), axis=-1)
@@ -232,7 +232,7 @@ def quantiles(draws: Float[np.ndarray, "draws ..."], levels: Sequence[float]) ->
 
 
 def band_of(draws: Float[np.ndarray, "draws ..."], level: float) -> np.ndarray:
-    """Lower and upper bound that hold this share of the draws. ValueError if it is no share."""
+    """Bounds that hold this fraction of the draws. ValueError if it is no fraction."""
     if not 0.0 < level < 1.0:
         raise ValueError(f"level must lie between 0 and 1, got {level}")
     return quantiles(draws, [0.5 - 0.5 * level, 0.5 + 0.5 * level])

@@ -85,8 +85,12 @@ def open_field(
         field = _field(source, variables, axes, dt_s, mask, chunks, problems)
     if doubt := _step_doubt(source, times, field, dt_s):
         warnings.warn(doubt, DoubtfulUnit, stacklevel=2)
-    said = {"channel_m": channel_m or source.channel_m, "file": str(source.path), STEP_DOUBT: doubt}
-    return field.assign_attrs({name: value for name, value in said.items() if value})
+    stated = {
+        "channel_m": channel_m or source.channel_m,
+        "file": str(source.path),
+        STEP_DOUBT: doubt,
+    }
+    return field.assign_attrs({name: value for name, value in stated.items() if value})
 
 
 def inspect_file(path: str | Path | Sequence[str | Path], *, plasma: bool = False) -> Inspection:

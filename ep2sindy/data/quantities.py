@@ -137,7 +137,7 @@ def words_of(name: str) -> tuple[str, ...]:
     return tuple(sorted(word for word in (WORDS.get(part, part) for part in parts) if word))
 
 
-def step_said(name: str, value: float) -> float | None:
+def stated_step(name: str, value: float) -> float | None:
     """Time step in s that a scalar of this name gives, or None if it is no step or rate."""
     last = last_of(name)
     plain = re.sub(r"[^a-z]", "", last.lower())
@@ -189,8 +189,8 @@ def quantity_of(name: str, stated: str, *, plasma: bool = False) -> tuple[str, s
     exact = (_in_hallthruster(name), last, base)
     for ours, full in FULL.items():
         if ours in exact or spelled & (full | SHORT[ours]):
-            is_said = plasma or bool(spelled & full)
-            fits = converts(ours, unit, is_variable=True) if unit else is_said
+            is_stated = plasma or bool(spelled & full)
+            fits = converts(ours, unit, is_variable=True) if unit else is_stated
             return (ours, unit) if fits else None
     return None
 

@@ -31,7 +31,7 @@ from ep2sindy.data.quantities import (
     last_of,
     own_unit,
     quantity_of,
-    step_said,
+    stated_step,
     words_of,
 )
 from ep2sindy.data.readers.source import FileSource
@@ -163,45 +163,46 @@ class _Arrays:
         return exact[0] if len(exact) == 1 else None
 
     @cached_property
-    def said_s(self) -> float | None:
+    def stated_s(self) -> float | None:
         """Time step in s that a preamble says, or scalars such as dt or fs if they agree."""
         scalars = [each for each in self.usable if not each.lengths and not each.dims]
         values = {
             e.name: e.low * (conversion("time", e.unit)[0] if converts("time", e.unit) else 1)
             for e in scalars
         }
-        said = {step_said(name, value) for name, value in values.items()} - {None}
-        return self.source.step_s or (said.pop() if len(said) == 1 else None)
+        stated = {stated_step(name, value) for name, value in values.items()} - {None}
+        return self.source.step_s or (stated.pop() if len(stated) == 1 else None)
 
     def step_s(self, time: Variable | None) -> float | None:
         """Time step in s from outside the time array, or None.
 
         A time array comes first, unless it merely numbers the samples. Without one, the step that
-        is said counts. Times that do not increase must still span what the step says, as rounded
+        is stated counts. Times that do not increase must still span what the step says, as rounded
         ones do.
         """
-        said_s = self.said_s
-        if said_s is None:
+        stated_s = self.stated_s
+        if stated_s is None:
             return None
         if time is None:
-            return said_s if self._spans(said_s) else None
+            return stated_s if self._spans(stated_s) else None
         one = self.at(time)
         if one is None:
             return None
         usual_s = (one.step or 0.0) * conversion("time", time.unit or "s")[0]
-        is_rounded = one.digits is not None and isclose(usual_s, said_s, rel_tol=0.2)
-        return said_s if one.is_counter or is_rounded else None
+        is_rounded = one.digits is not None and isclose(usual_s, stated_s, rel_tol=0.2)
+        return stated_s if one.is_counter or is_rounded else None
 
-    def _spans(self, said_s: float) -> bool:
+    def _spans(self, stated_s: float) -> bool:
         """True unless times that do not increase span something else than steps of this length."""
         for each in self.usable:
-            span_s = (max(each.shape, default=1) - 1) * said_s
-            differs = abs(each.high - each.low - span_s) > 0.01 * span_s + 10.0 * said_s
+            span_s = (max(each.shape, default=1) - 1) * stated_s
+            differs = abs(each.high - each.low - span_s) > 0.01 * span_s + 10.0 * stated_s
             if each.falls and axis_of(each.name) == "time" and differs:
                 self.questions.append(
                     f"the times of {each.name!r} run over {each.high - each.low:.6g}, and samples "
-                    f"in the file's steps of {said_s:.6g} s over {span_s:.6g} s: give dt_s if the "
-                    "steps are equal, or the stretches as files of their own"
+                    f"in the file's steps of {stated_s:.6g} s over {span_s:.6g} s: give dt_s if "
+                    "the "
+                    "steps are equal, or the segments as files of their own"
                 )
                 return False
         return True
@@ -214,11 +215,13 @@ class _Arrays:
         if (one := self.at(time)) is None:
             return time
         steps_s = {unit: (one.step or 0.0) * conversion("time", unit)[0] for unit in UNITS_OF_TIME}
-        if not time.unit and self.said_s is not None:
-            fit = [u for u, step_s in steps_s.items() if isclose(step_s, self.said_s, rel_tol=1e-3)]
+        if not time.unit and self.stated_s is not None:
+            fit = [
+                u for u, step_s in steps_s.items() if isclose(step_s, self.stated_s, rel_tol=1e-3)
+            ]
             time = replace(time, unit=fit[0] if fit else "")
-        times, said_s = f"the times of {one.name!r}", self.source.step_s
-        said = f", and the file says steps of {said_s:.6g} s beside them" if said_s else ""
+        times, stated_s = f"the times of {one.name!r}", self.source.step_s
+        stated = f", and the file says steps of {stated_s:.6g} s beside them" if stated_s else ""
         usual_s = (one.step or 0.0) * conversion("time", time.unit or "s")[0]
         if one.digits is not None:
             self.questions.append(
@@ -228,11 +231,11 @@ class _Arrays:
         if one.gap:
             unit = f", in {time.unit}" if time.unit else ""
             self.questions.append(
-                f"{times} have a gap: {one.gap}{unit}{said}; the times are taken as they stand"
+                f"{times} have a gap: {one.gap}{unit}{stated}; the times are taken as they stand"
             )
-        elif said_s and usual_s and time.unit and abs(usual_s - said_s) > 0.01 * said_s:
+        elif stated_s and usual_s and time.unit and abs(usual_s - stated_s) > 0.01 * stated_s:
             self.questions.append(
-                f"{times} go in steps of {usual_s:.6g} s{said}; the times are taken"
+                f"{times} go in steps of {usual_s:.6g} s{stated}; the times are taken"
             )
         return time
 

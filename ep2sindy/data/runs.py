@@ -182,8 +182,8 @@ def _from_field(field: xr.Dataset, partial: bool) -> Trajectory:
         )
     if (unit := str(field["time"].attrs.get("units", "s"))) != "s":
         times = seconds_in(unit) * field["time"].values
-        said = {CLOCK: unit} | field["time"].attrs | {"units": "s"}
-        field = field.assign_coords(time=("time", times, said))
+        stated = {CLOCK: unit} | field["time"].attrs | {"units": "s"}
+        field = field.assign_coords(time=("time", times, stated))
     run = _from_table(field.to_dataframe()[list(field.data_vars)], partial)
     units = {str(name): str(each.attrs.get("units", "1")) for name, each in field.variables.items()}
     point = {
@@ -225,8 +225,8 @@ def _from_table(table: pd.DataFrame, partial: bool) -> Trajectory:
     if kinds[times[0]].kind in "mM":
         del wrong[times[0]]
     if wrong:
-        way_out = "give time in s, as numbers or dates" if times[0] in wrong else "drop them"
-        raise ValueError(f"columns of a table must hold real numbers, got {wrong}; {way_out}")
+        hint = "give time in s, as numbers or dates" if times[0] in wrong else "drop them"
+        raise ValueError(f"columns of a table must hold real numbers, got {wrong}; {hint}")
     values, units = columns_in_si(table[states])
     states = list(units)
     t, clock = _elapsed(table[times[0]])

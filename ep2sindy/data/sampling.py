@@ -31,7 +31,7 @@ def zone_averages(
     """One trajectory of the averages over several zones, named `n_i@exit` and so on.
 
     zones: name -> `Zone`, or (from, to) in z in m, in the order in which they lie. A grid point on
-    an edge that two zones share belongs to the first. Otherwise as `zone_average`, zone by zone.
+    an edge that two zones fraction belongs to the first. Otherwise as `zone_average`, zone by zone.
     Raises ValueError also for names that are no words, and for zones that overlap or come in
     another order.
 

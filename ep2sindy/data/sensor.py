@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 # repeats. Rounded samples need more than TIMES the largest count among the NEXT nearest levels; at
 # the crest of a sine that ratio is 2.5.
 FEWEST, TIMES, NEXT = 3, 5, 3
-REPEATS = 0.01  # samples count as rounded if a larger share of their values repeats
+REPEATS = 0.01  # samples count as rounded if a larger fraction of their values repeats
 SAMPLES_PER_LEVEL = 3  # least number of samples per level for samples that count as rounded
 EVEN = 0.01  # tolerance on distances between levels being whole steps, as a fraction of a step
 DITHERED = 0.5  # noise in units of the step, above which rounding acts like ordinary noise

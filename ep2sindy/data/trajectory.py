@@ -1,4 +1,4 @@
-"""A trajectory: sampled states and inputs of one system over one stretch of time."""
+"""A trajectory: sampled states and inputs of one system over one segment of time."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ep2sindy.data.gaps import LONGEST_STEP, MIN_STRETCH, between_gaps, mean_step, usual_step
+from ep2sindy.data.gaps import LONGEST_STEP, MIN_SEGMENT, between_gaps, mean_step, usual_step
 from ep2sindy.data.numbers import check_magnitude, real_numbers, rounding_s, seconds
 from ep2sindy.library.names import check_state, check_variable
 from ep2sindy.library.units import SECONDS, Clock
@@ -205,11 +205,11 @@ class Trajectory:
             missing=None if self.missing is None else self.missing[part],
         )
 
-    def stretches(self, min_samples: int = MIN_STRETCH) -> list[Trajectory]:
-        """The stretches between gaps as trajectories of their own; only itself, if it has no gap.
+    def segments(self, min_samples: int = MIN_SEGMENT) -> list[Trajectory]:
+        """The segments between gaps as trajectories of their own; only itself, if it has no gap.
 
         Nothing that takes differences or integrates may lead across a gap (`between_gaps`).
-        Stretches of fewer samples, and those in which a state rests, are left out.
+        Segments of fewer samples, and those in which a state rests, are left out.
         Raises ValueError if none is left.
         """
         pieces = between_gaps(self.t)
@@ -402,7 +402,7 @@ def _way_to_agree(first: Trajectory, missing: Sequence[str]) -> str:
 
 
 def spread_blocks(runs: Sequence[Trajectory], *, most: int, block: int) -> list[Trajectory]:
-    """Blocks of neighbouring samples that tell a law or a misfit nearly as well as a long record.
+    """Blocks of neighbouring samples that show a law, or none, nearly as well as a long record.
 
     They are spread evenly over the records, whose noise may change, and have at most `most` samples
     together, each at most `block`. Records of at most `most` samples together come back whole.

@@ -157,11 +157,11 @@ def _means(
             raw, here = grid_values(block[name]), _of_cells(masked, cells)
             check_samples(block[name], raw, here)
             values[name] = np.where(here, 0.0, raw)
-        share = _of_cells(weights, cells)
+        fraction = _of_cells(weights, cells)
         for j, factors in enumerate(columns):
             product = math.prod(values[name] ** power for name, power in factors)
-            spread = np.broadcast_to(product, (block.sizes["time"], *share.shape))
-            means[where["time"], j] += np.einsum("tzr,zr->t", spread, share)
+            spread = np.broadcast_to(product, (block.sizes["time"], *fraction.shape))
+            means[where["time"], j] += np.einsum("tzr,zr->t", spread, fraction)
     return means
 
 
@@ -176,8 +176,8 @@ def _of_cells(grid: np.ndarray, cells: Sequence[slice]) -> np.ndarray:
 # Zones: part of a grid in z and r, given by its ends or as a part of a thruster's channel.
 
 
-# Shares of the channel's length up to its exit, by name. Through the ends of the whole channel pass
-# a known inflow and what leaves the thruster; the thesis averages over the downstream part.
+# Fractions of the channel's length up to its exit, by name. Through the ends of the whole channel
+# pass a known inflow and what leaves the thruster; the thesis averages over the downstream part.
 PARTS = {"channel": 1.0, "downstream": 0.4}
 
 
@@ -287,7 +287,8 @@ def zone_slices(field: xr.Dataset, zone: Zone) -> dict[str, slice]:
         beyond = max(points[0] - bounds[0] - steps[0], bounds[1] - points[-1] - steps[-1])
         if start >= stop or beyond > rounding:
             raise ValueError(
-                f"a zone must hold grid points and stay on the grid, got {axis} from {bounds[0]:g} to "
+                f"a zone must hold grid points and stay on the grid, got {axis} from "
+                f"{bounds[0]:g} to "
                 f"{bounds[1]:g} m, the grid has {len(points)} points from {points[0]:g} to "
                 f"{points[-1]:g} m; take a zone on the grid ('trajectory.zone.{axis}=[FROM,TO]')"
             )

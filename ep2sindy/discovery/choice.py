@@ -131,7 +131,7 @@ def join_choice(
     )
 
 
-def judge_noise(choice: Discovery, runs: Sequence[Trajectory]) -> NoiseTest:
+def assess_noise(choice: Discovery, runs: Sequence[Trajectory]) -> NoiseTest:
     """Test the residuals of the chosen model against the noise of the samples.
 
     A state that the final fit has tested on its own rows keeps that result. Any other state is
@@ -144,24 +144,26 @@ def judge_noise(choice: Discovery, runs: Sequence[Trajectory]) -> NoiseTest:
     only if the chosen model is its own. By whatever method, a measured state that the model leaves
     at rest must show nothing but white noise there.
     """
-    estimate, (moves, still) = choice.estimate, _judge_rest(choice.model, runs)
+    estimate, (moves, still) = choice.estimate, _assess_rest(choice.model, runs)
     if estimate is not None and estimate.model is choice.model:
-        misfit = estimate.misfit
-        return NoiseTest(misfit=misfit, tested=True, note="" if misfit else still)
+        lack_of_fit = estimate.lack_of_fit
+        return NoiseTest(lack_of_fit=lack_of_fit, tested=True, note="" if lack_of_fit else still)
     runs = runs if estimate is None else estimate.runs  # with hidden states
     states, tested, n_free = choice.model.states, choice.noise_test.left, choice.noise_test.n_free
     unknown = [state for state in states if state not in tested]
     found = {**tested, **(_test_on_weak_rows(choice, runs, unknown) if unknown else {})}
     ordered = {state: found[state] for state in states if state in found}
-    misfit = _describe_misfit(ordered, n_free) or moves
-    return NoiseTest(ordered, misfit, bool(ordered or misfit), n_free, "" if misfit else still)
+    lack_of_fit = _describe_lack_of_fit(ordered, n_free) or moves
+    return NoiseTest(
+        ordered, lack_of_fit, bool(ordered or lack_of_fit), n_free, "" if lack_of_fit else still
+    )
 
 
-def _judge_rest(model: SparseModel, runs: Sequence[Trajectory]) -> tuple[str, str]:
-    """What is to be said of measured states that a model leaves at rest, or drifting at a rate.
+def _assess_rest(model: SparseModel, runs: Sequence[Trajectory]) -> tuple[str, str]:
+    """What to report of measured states that a model leaves at rest, or drifting at a rate.
 
-    If their samples are no white noise about that, why this is a misfit; and a note if they are, or
-    if they are too few to tell. Samples of instants at which all states were measured count.
+    If their samples are no white noise about that, why this does not fit; and a note if they are,
+    or if they are too few to tell. Samples of instants at which all states were measured count.
     """
     terms = {s: model.terms(s) for s in model.states if s in runs[0].state_names}
     rest = [s for s, own in terms.items() if set(own) <= {"1"}]
@@ -224,7 +226,7 @@ def _count_free(held: Constraint, relations: Sequence[Relation]) -> dict[str, in
     }
 
 
-def _describe_misfit(left: Mapping[str, LeftOver], related: Collection[str]) -> str:
+def _describe_lack_of_fit(left: Mapping[str, LeftOver], related: Collection[str]) -> str:
     """Sentence on the equations whose residuals exceed the noise; empty if there are none.
 
     related: states whose coefficients obey relations.
@@ -239,11 +241,11 @@ def _describe_misfit(left: Mapping[str, LeftOver], related: Collection[str]) -> 
         return (
             f"the model leaves more than white noise of {parts} under its relations: intervals are "
             "not given; check the relations, weigh the rows (WeightedWeak()), add terms or states, "
-            "or judge the model by free run"
+            "or assess the model by free run"
         )
     return (
         f"no equation of this library leaves white noise of {parts}: intervals are not given; "
-        "add terms or states, or judge the model by free run"
+        "add terms or states, or assess the model by free run"
     )
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from ep2sindy.data.coerce import Task
 from ep2sindy.data.runs import Runs, trajectories_of
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.choice import judge_noise
+from ep2sindy.discovery.choice import assess_noise
 from ep2sindy.discovery.method import TrajectorySearch, of_means
 from ep2sindy.discovery.result import Discovery, DiscoveryMethod, join_points
 from ep2sindy.library.library import Library, polynomial
@@ -159,9 +159,9 @@ def _discover_point(
 ) -> Discovery:
     task, rng = piece
     found = method.identify(task, rng=rng, progress=progress)
-    test = judge_noise(found, task.runs)
+    test = assess_noise(found, task.runs)
     # Intervals of a model that does not explain the data would not cover the truth.
-    covariance = None if test.misfit else found.model.covariance
+    covariance = None if test.lack_of_fit else found.model.covariance
     model = replace(found.model, clock=task.runs[0].clock, covariance=covariance)
-    note = "; ".join(filter(None, [test.note, found.note or test.misfit]))
+    note = "; ".join(filter(None, [test.note, found.note or test.lack_of_fit]))
     return replace(found, model=model, method=method, noise_test=test, note=note)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ep2sindy.forecasting.baselines import AUTOREGRESSION, NEIGHBOURS, baseline_errors
-from ep2sindy.signals.trace import Trace
+from ep2sindy.signals.signal import Signal
 
 # Error of neighbours, in standard deviations, at which a signal is no longer foreseen: halfway to
 # the mean, whose error is one.
@@ -12,7 +12,7 @@ HALF = 0.5
 AHEAD = 0.5  # turns ahead for which neighbours are chosen
 N_STARTS = 100
 
-# Of fewer turns, a moment may have no neighbours, and nothing is said.
+# Of fewer turns, a moment may have no neighbours, and nothing is reported.
 ENOUGH_TURNS = 20.0
 
 # What a signal with a law of few states shows: neighbours that go on alike for a quarter of a turn,
@@ -20,7 +20,7 @@ ENOUGH_TURNS = 20.0
 TURN, NEARER = 0.25, 0.9
 
 
-def is_linear(signal: Trace) -> bool:
+def is_linear(signal: Signal) -> bool:
     """Whether what followed the most similar moments tells no more than a linear autoregression.
 
     The second half of the signal is forecast from its own past, by neighbours in the first. They

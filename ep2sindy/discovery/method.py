@@ -56,14 +56,13 @@ class TrajectorySearch:
     For noisy samples of all states of a system whose law the library holds. No derivative is
     estimated, so it finds laws that no regression can (docs/estimation.md). The noise may be white,
     or correlated over some samples. max_terms: of one equation; None allows seven, and more where
-    an equation of a large library needs them. align: if True, channels found to be late are shifted
-    forward; if False, late channels make the model a misfit, and their delays are reported.
-    limit_s: wall time after which the search ends with the best that it has, and says so. courses:
-    input -> how it goes from one sample to the next, "held", "linear" or "smooth"; of others the
-    likeliest course is taken.
-    selection: Evidence, or a rule that runs models, such as FreeRunScore. depth: candidates kept
-    per size, for such a rule to judge.
-    Raises ValueError for fewer than one term, or a rule that does not go with the search.
+    an equation of a large library needs them. align: if True, channels found to be delayed are
+    shifted forward; if False, delayed channels count as a lack of fit of the model, and their
+    delays are reported. limit_s: wall time after which the search ends with the best that it has,
+    and says so. courses: input -> how it goes from one sample to the next, "held", "linear" or
+    "smooth"; of others the likeliest course is taken. selection: Evidence, or a rule that runs
+    models, such as FreeRunScore. depth: candidates kept per size, for such a rule to assess. Raises
+    ValueError for fewer than one term, or a rule that does not go with the search.
     """
 
     max_terms: int | None = None
@@ -100,8 +99,9 @@ class TrajectorySearch:
         """
         if task.facts.roles is not None and self.selection.basis == "runs":
             raise ValueError(
-                "a search of trajectories keeps roles by likelihood: selection must be Evidence(), got "
-                f"{self.selection!r}; Regression(selection=FreeRunScore()) judges by runs"
+                "a search of trajectories keeps roles by likelihood: selection must be "
+                "Evidence(), got "
+                f"{self.selection!r}; Regression(selection=FreeRunScore()) tests by runs"
             )
         found = self._estimate(task, progress)
         library = task.library.with_known_terms(task.states)
@@ -168,7 +168,7 @@ def _front(
 
 
 def _ambiguities_of_samples(task: Task) -> tuple[Ambiguity, ...]:
-    """Terms whose values at the samples cannot be told apart."""
+    """Terms whose values at the samples cannot be distinguished."""
     library = task.library
     values = [noise_inside(library, run.columns(library.variables)) for run in task.runs]
     theta = library.evaluate(np.concatenate(values))
@@ -284,7 +284,7 @@ class Regression:
         with progress.stage(None, "", "rows of the regression"):
             problems = self.formulation.assemble(task.runs, library, rng=rng)
         systems = search_conserving_systems(problems, task, roles, self.search, depth=self.depth)
-        decision = self.selection.judge(systems, task.runs, progress=progress)
+        decision = self.selection.assess(systems, task.runs, progress=progress)
         provenance = self.provenance | _labels(task)
         return choose_system(systems.fronts, decision, self, task.runs, provenance=provenance)
 
@@ -340,8 +340,8 @@ def _limits(runs: Sequence[Trajectory]) -> tuple[str, ...]:
     """Remarks on clipped or rounded samples, for regressions on rows."""
     found = [bounds_of(run.states, run.state_names) for run in runs]
     words = dict.fromkeys(each for bounds in found if bounds for each in bounds.words)
-    way_out = "rows take them for values; TrajectorySearch() reads them as limits"
-    return tuple(f"{each}: {way_out}" for each in words)
+    hint = "rows take them for values; TrajectorySearch() reads them as limits"
+    return tuple(f"{each}: {hint}" for each in words)
 
 
 def of_means(method: AnyMethod) -> AnyMethod:

@@ -35,14 +35,14 @@ from ep2sindy.regression.searches import BestSubset
 from ep2sindy.runtime.parallel import Once, at_once
 from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.signals.embedding import HARMONICS, Embedded, Embedding, embed, unexplained
-from ep2sindy.signals.trace import Trace, is_positive
+from ep2sindy.signals.signal import Signal, is_positive
 
-# Error of forecasts, as a share of that of earlier preparations, from which a later one is taken;
-# starts from which it is counted, and draws of each.
+# Error of forecasts, as a fraction of that of earlier preparations, from which a later one is
+# taken; starts from which it is counted, and draws of each.
 CLEARLY, N_TRIED, N_DRAWS_TRIED = 0.8, 20, 20
 
 # Candidates of a size if no equation is known, so that there are few combinations, and of more than
-# two states, which have no cycle to live on: the best of a size foresees as well as the eighth.
+# two states, which have no cycle to run on: the best of a size foresees as well as the eighth.
 FEW = 2
 
 MAX_FITTED = 3000  # samples from the end of the fitted part that a search for hidden states sees
@@ -54,11 +54,11 @@ FIRST_PART, FIRST_PERIODS = 300, 8.0
 EXPLAINED = "their equations explain the signal to its noise"
 
 MIN_FITTED = 4.0  # periods that a fitted part must have
-MIN_JUDGED = 1.5  # periods that a held-out part must have
+MIN_ASSESSED = 1.5  # periods that a held-out part must have
 
 
 @dataclass(frozen=True)
-class ToldFacts:
+class StatedFacts:
     """What is known of the equations of a signal and its states, beside what these are.
 
     exclude: state -> terms that its equation does not have. relations: between coefficients, as
@@ -71,7 +71,7 @@ class ToldFacts:
     relations: Sequence[str] = ()
     rests_at_zero: bool = False
 
-    def check(self, tried: Sequence[Preparation], signal: Trace) -> None:
+    def check(self, tried: Sequence[Preparation], signal: Signal) -> None:
         """Raise ValueError for facts of states that no preparation makes of the signal."""
         names = {name for each in tried for name in each.names(signal)}
         if lost := set(self.exclude) - names:
@@ -125,19 +125,20 @@ class Preparation:
         own = "derivative" if self.how == "auto" else self.how
         Embedding(own, self.n_states, self.harmonics)  # refuses settings that no embedding has
 
-    def names(self, signal: Trace) -> set[str]:
+    def names(self, signal: Signal) -> set[str]:
         """States that it makes of a signal, or may make."""
         ways = ("rate", "derivative", "delays") if self.how == "auto" else (self.how,)
         made = (Embedding(how, self.n_states, self.harmonics).names(signal) for how in ways)
         return {name for names in made for name in names}
 
-    def linear(self, signal: Trace) -> Preparation:
+    def linear(self, signal: Signal) -> Preparation:
         """The same with linear equations, of a derivative: x' = x g is not linear in the states."""
         is_rate = self.how == "rate" or (self.how == "auto" and signal.is_positive)
         return replace(self, how="derivative" if is_rate else self.how, degree=1, functions=())
 
     def search(
-        self, past: Trace, method: AnyMethod, told: ToldFacts, *, seed: int, progress: Progress,
+        self, past: Signal, method: AnyMethod, stated: StatedFacts, *, seed: int,
+        progress: Progress,
         once: Once,
     ) -> tuple[Embedded, Discovery]:  # fmt: skip
         """The states, and their equations. method: of smoothed states."""
@@ -147,32 +148,32 @@ class Preparation:
         run, functions = states.run, self.functions
         if any(FITTED in text for text in functions):
             smoothed = make() if states.unsmoothed else states
-            off = partial(self._misfit, smoothed, method, told)
+            off = partial(self._lack_of_fit, smoothed, method, stated)
             functions = fit_functions(functions, smoothed.run, off)
         if states.unsmoothed:
             run, method = end_of(run), by_trajectories(method)
         elif not states.known or self.n_states > 2:
             method = replace(method, depth=min(method.depth, FEW))
-        library = self._library(states, functions, told)
+        library = self._library(states, functions, stated)
         search = partial(
             discover, run, library, method, hidden=states.hidden, decimate=None, seed=seed
         )
         return states, once(partial(search, progress=progress))
 
-    def _library(self, states: Embedded, functions: Sequence[str], told: ToldFacts) -> Library:
-        return told.add_to(states.library(self.degree, functions, self.function_degree), states)
+    def _library(self, states: Embedded, functions: Sequence[str], stated: StatedFacts) -> Library:
+        return stated.add_to(states.library(self.degree, functions, self.function_degree), states)
 
-    def _misfit(
-        self, states: Embedded, method: AnyMethod, told: ToldFacts, functions: Sequence[str]
+    def _lack_of_fit(
+        self, states: Embedded, method: AnyMethod, stated: StatedFacts, functions: Sequence[str]
     ) -> float:
-        """Share of the derivatives that the largest candidates leave, the product over equations.
+        """What the largest candidates leave of the derivatives, the product over equations.
 
         Infinite for functions that cannot be used on the states.
         """
         if isinstance(method, TrajectorySearch):
             method = Regression(search=BestSubset(max_terms=method.max_terms or FIRST_MAX_TERMS))
         try:
-            library = self._library(states, functions, told)
+            library = self._library(states, functions, stated)
             equations = method.search_equations(Task([states.run], library), rng=0)
         except ValueError:
             return float("inf")
@@ -186,8 +187,8 @@ class Attempt:
 
     states: as they were made. run: all of them along the fitted part, hidden ones as the model has
     them. estimator: of these. error: of the model's forecasts up to a period there, in standard
-    deviations. share: of the next state's variance that neighbours in these states do not explain;
-    NaN for hidden states, of which there is no next one.
+    deviations. fraction: of the next state's variance that neighbours in these states do not
+    explain; NaN for hidden states, of which there is no next one.
     """
 
     preparation: Preparation
@@ -196,18 +197,18 @@ class Attempt:
     run: Trajectory
     estimator: StateEstimator
     error: float
-    share: float
+    fraction: float
 
     @staticmethod
     def of(
         preparation: Preparation, states: Embedded, found: Discovery, progress: Progress
     ) -> Attempt:
-        past, run, share = states.signal, states.run, float("nan")
+        past, run, fraction = states.signal, states.run, float("nan")
         with progress.stage(None, "", "forecasts where it was fitted"):
             if states.unsmoothed:
                 run = estimate_states(found.model, run)
             else:
-                share = unexplained(states)
+                fraction = unexplained(states)
             samples = complete_states(past, run)
             estimator = tune_estimator(found.model, samples, measured=[past.name])
             skill = forecast_skill(
@@ -216,7 +217,7 @@ class Attempt:
                 estimator=estimator,
             )  # fmt: skip
         error = float(skill.nrmse[MODEL].mean())
-        return Attempt(preparation, states, found, run, estimator, error, share)
+        return Attempt(preparation, states, found, run, estimator, error, fraction)
 
     @property
     def searched(self) -> list[str]:
@@ -251,8 +252,8 @@ class Attempt:
 
 
 def try_in_turn(
-    past: Trace, tried: Sequence[Preparation], method: AnyMethod, *,
-    told: ToldFacts | None = None, linear: bool | None = None,
+    past: Signal, tried: Sequence[Preparation], method: AnyMethod, *,
+    stated: StatedFacts | None = None, linear: bool | None = None,
     seed: int = 0, progress: Progress = SILENT, once: Once = at_once,
 ) -> list[Attempt]:  # fmt: skip
     """Find a model of a signal by each preparation that can pay.
@@ -263,11 +264,11 @@ def try_in_turn(
     states are tried only of a signal that does not repeat itself, and that no input drives: one of
     two states either repeats itself or spirals. The signal alone is tried only with inputs. Of a
     linear signal, linear equations of the first smoothed states alone are tried. method: of the
-    search in smoothed states; a rule that runs models judges them by the signal. told: of the
+    search in smoothed states; a rule that runs models tests them by the signal. stated: of the
     equations. linear: whether the signal is (`is_linear`); None finds out. once: does each search,
     or takes it from a run that was broken off.
     """
-    told, linear = told or ToldFacts(), is_linear(past) if linear is None else linear
+    stated, linear = stated or StatedFacts(), is_linear(past) if linear is None else linear
     smoothed = [each for each in tried if each.how != "hidden"]
     if past.run.input_names:  # then they make what is more than a cycle
         tried = [each for each in tried if each.n_states <= 2] or tried
@@ -277,13 +278,13 @@ def try_in_turn(
             tried = [each for each in tried if each.n_states == 2] or tried
         elif linear and smoothed:
             tried = [smoothed[0].linear(past)]
-    method, part = judged_by(method, past.name), end_of_periods(past)
+    method, part = assessed_by(method, past.name), end_of_periods(past)
     attempts, left_out = [], []
     for each in tried:
         search = partial(
-            each.search, method=method, told=told, seed=seed, progress=progress, once=once
+            each.search, method=method, stated=stated, seed=seed, progress=progress, once=once
         )
-        if each.how == "hidden" and smoothed and part is not past and search(part)[1].misfit:
+        if each.how == "hidden" and smoothed and part is not past and search(part)[1].lack_of_fit:
             continue
         states, found = search(past)
         if not states.unsmoothed:
@@ -296,19 +297,19 @@ def try_in_turn(
     return attempts or [Attempt.of(*left_out[-1], progress)]
 
 
-def judged_by(method: AnyMethod, signal: str) -> AnyMethod:
-    """The method; models that are run are judged by the signal, of which other states are made."""
+def assessed_by(method: AnyMethod, signal: str) -> AnyMethod:
+    """The method; models that run are assessed by the signal, of which other states are made."""
     if not isinstance(method, Regression) or method.selection.basis != "runs":
         return method
     from ep2sindy.selection.free_run import FreeRunScore  # loads torch, only for this rule
 
     rule = method.selection
-    if not isinstance(rule, FreeRunScore) or rule.judged is not None:
+    if not isinstance(rule, FreeRunScore) or rule.assessed is not None:
         return method
-    return replace(method, selection=replace(rule, judged=(signal,)))
+    return replace(method, selection=replace(rule, assessed=(signal,)))
 
 
-def end_of_periods(past: Trace) -> Trace:
+def end_of_periods(past: Signal) -> Signal:
     """The last periods of a signal, on which a search for hidden states is tried first."""
     n, wanted = len(past.t), max(FIRST_PART, round(FIRST_PERIODS * past.per_period))
     return past if 2 * wanted > min(n, MAX_FITTED) else past.window(n - wanted, n)
@@ -325,30 +326,31 @@ def best_of(attempts: Sequence[Attempt]) -> Attempt:
 def explains(found: Discovery, signal: str) -> bool:
     """Whether a model explains a signal to its noise, and run freely over it stays with it.
 
-    Nor may its cycle repel: a departure that grew would show in a record that keeps its amplitude.
+    Nor may its cycle repel: a perturbation that grew would show in a record that keeps its
+    amplitude.
     """
     assert found.estimate is not None  # a search of trajectories has one
-    if found.misfit:
+    if found.lack_of_fit:
         return False
     (record,), (path,) = found.estimate.runs, found.estimate.paths
-    free = evaluate(found.estimate.model, record, initial=path[0], judged=[signal])
+    free = evaluate(found.estimate.model, record, initial=path[0], assessed=[signal])
     if not free.is_similar or free.cycle is None:
         return free.is_similar
     n_periods = float(record.t[-1] - record.t[0]) / free.cycle.period_s
     return bool(free.multiplier**n_periods < SPIRALS)
 
 
-def fitted_part(signal: Trace, held_out: float) -> Trace:
-    """The samples before the last share; all of them if the record is too short for that."""
+def fitted_part(signal: Signal, held_out: float) -> Signal:
+    """The samples before the last fraction; all of them if the record is too short for that."""
     n = len(signal.t)
     n_fitted = round((1.0 - held_out) * n)
     periods = np.array([n_fitted, n - n_fitted]) / signal.per_period
-    enough = periods[0] >= MIN_FITTED and periods[1] >= MIN_JUDGED
+    enough = periods[0] >= MIN_FITTED and periods[1] >= MIN_ASSESSED
     return signal.window(0, n_fitted if enough else n)
 
 
 def run_on_rest(
-    signal: Trace, best: Attempt, *, progress: Progress = SILENT
+    signal: Signal, best: Attempt, *, progress: Progress = SILENT
 ) -> tuple[Trajectory, Evaluation]:
     """Run a model freely over the samples that were not fitted, which it also forecasts.
 
@@ -370,11 +372,11 @@ def run_on_rest(
             estimator=estimator, progress=progress,
         )  # fmt: skip
     rest = whole.window(first, n)
-    evaluation = evaluate(best.found, rest, initial=start, judged=[signal.name])
+    evaluation = evaluate(best.found, rest, initial=start, assessed=[signal.name])
     return whole, replace(evaluation, forecasts=forecasts)
 
 
-def complete_states(signal: Trace, known: Trajectory) -> Trajectory:
+def complete_states(signal: Signal, known: Trajectory) -> Trajectory:
     """Samples of the signal as measured, with the other states beside it as far as they are known.
 
     Where a state is not known, at the beginning or beyond the fitted part, the nearest is taken;
@@ -404,7 +406,7 @@ SHIFTS = (0.3, 0.0, 0.1, -0.3)
 
 
 def fit_offset(
-    past: Trace, degree: int, method: AnyMethod, *,
+    past: Signal, degree: int, method: AnyMethod, *,
     progress: Progress = SILENT, once: Once = at_once,
 ) -> tuple[float, float, float]:  # fmt: skip
     """Fit the offset of a signal x, by the equations of x and of the growth rate g of x + offset.
@@ -426,11 +428,11 @@ def fit_offset(
         hidden=[g],
         progress=progress,
     )
-    for share in SHIFTS:
-        shift = share * spread - mean
+    for fraction in SHIFTS:
+        shift = fraction * spread - mean
         found = once(partial(search, replace(run, states=run.states + shift)))
         rest = found.model.terms(x).get(g, 0.0)
-        if not found.misfit and is_positive(past.t, past.x + shift + rest):
+        if not found.lack_of_fit and is_positive(past.t, past.x + shift + rest):
             low, high = found.model.intervals(x).get(g, (rest, rest))
             return shift + rest, shift + low, shift + high
     raise ValueError(
@@ -452,22 +454,21 @@ DIGITS = 4  # that are kept of it
 
 
 def fit_functions(
-    functions: Sequence[str], run: Trajectory, misfit: Callable[[Sequence[str]], float]
+    functions: Sequence[str], run: Trajectory, lack_of_fit: Callable[[Sequence[str]], float]
 ) -> list[str]:
     """The functions with every `?` replaced by the number that fits a run best.
 
     One after the other: earlier numbers are kept while later ones are fitted, and functions whose
-    number is still unknown are left out meanwhile. misfit: how badly the best equations with some
-    functions fit; infinite if these cannot be used.
-    Raises ValueError for a function with more than one `?`, of no variable of the run, or none of
-    whose numbers can be used.
+    number is still unknown are left out meanwhile. lack_of_fit: how badly the best equations with
+    some functions fit; infinite if these cannot be used. Raises ValueError for a function with more
+    than one `?`, of no variable of the run, or none of whose numbers can be used.
     """
     known = [text for text in functions if FITTED not in text]
     for text in (each for each in functions if FITTED in each):
         fill_in = partial(_fill_in, text, unit=_unit(text, run))
 
         def off(log_size: float, fill_in: Callable[[float], str] = fill_in) -> float:
-            return misfit([*known, fill_in(np.exp(log_size))])
+            return lack_of_fit([*known, fill_in(np.exp(log_size))])
 
         tried = np.array([off(log_size) for log_size in np.log(SIZES)])
         if not np.isfinite(tried).any():

@@ -54,7 +54,7 @@ class PointSearch:
     library: with relations between coefficients, if there are some, such as
     "n_i: S == -1 * n_n: S" for ionization S, which makes of a neutral an ion; the same at every
     point.
-    least_variation: standard deviation of every state, as a share of its root mean square, below
+    least_variation: standard deviation of every state, as a fraction of its root mean square, below
     which a point counts as having no dynamics. seed: every point has the same split and the same
     draws, so that results differ by place alone.
     """
@@ -71,7 +71,7 @@ class PointSearch:
         object.__setattr__(self, "states", tuple(self.states))
         if not 0.0 <= self.least_variation < 1.0:
             raise ValueError(
-                f"least_variation must lie in [0, 1), got {self.least_variation}; it is a share"
+                f"least_variation must lie in [0, 1), got {self.least_variation}; it is a fraction"
             )
         check_kind("method", self.method, Regression, "ep.Regression(bootstraps=ep.Bootstraps())")
         if not (n := self.method.bootstraps.n):
@@ -80,7 +80,8 @@ class PointSearch:
         constraint(self.library, every_term, facts.relations)  # refuses those that cannot hold
         if facts.roles is not None:
             raise ValueError(
-                "roles tie all equations together, and a pointwise study searches one at a time, got "
+                "roles tie all equations together, and a pointwise study searches one at a time, "
+                "got "
                 f"{facts.roles}; give relations"
             )
         if facts.relations and (n_culled := self.method.bootstraps.n_culled):
@@ -113,17 +114,15 @@ def pointwise(
     """Search at every point of a (time, z, r), (time, z) or (time, r) field, block by block.
 
     Returns, over `equation`, `term`, `draw` and the axes of the field:
-    coef, in SI, zero for a term outside the selected support; inclusion, share of bootstraps whose
-    support of that size held the term; weight, coef times the root mean square of its term, with
-    its sign, as a share of all terms of the equation (not the variance: the constant has none);
-    coef_draws and weight_draws, the same in every bootstrap; r2_train, r2_test, n_terms per
+    coef, in SI, zero for a term outside the selected support; inclusion, fraction of bootstraps
+    whose support of that size held the term; weight, coef times the root mean square of its term,
+    with its sign, as a fraction of all terms of the equation (not the variance: the constant has
+    none); coef_draws and weight_draws, the same in every bootstrap; r2_train, r2_test, n_terms per
     equation; status per point. If the status is not 0, the others are NaN. The attribute no_fit
-    holds a reason why a fit failed, if one did.
-    If the field is opened lazily, only the current block is in memory.
-    progress: True shows a bar; a function is called with the number of points of every finished
-    block; see `Progress`.
-    Raises ValueError for a field without space, a variable it lacks, or, with the first reason, if
-    no point could be fitted.
+    holds a reason why a fit failed, if one did. If the field is opened lazily, only the current
+    block is in memory. progress: True shows a bar; a function is called with the number of points
+    of every finished block; see `Progress`. Raises ValueError for a field without space, a variable
+    it lacks, or, with the first reason, if no point could be fitted.
     """
     _check(field, search)
     part = field[list(search.variables)]
@@ -205,7 +204,7 @@ def _search_block(search: PointSearch, block: xr.Dataset) -> xr.Dataset:
     grids = [np.broadcast_to(grid, whole).reshape(len(t), *shape) for grid in grids]
     for place in np.ndindex(shape):
         values = np.stack([grid[(..., *place)] for grid in grids])
-        status = _judge_samples(values, search)
+        status = _assess_samples(values, search)
         if status == 0:
             try:
                 point = search_point(_trajectory(t, values, block, search), search)
@@ -218,8 +217,8 @@ def _search_block(search: PointSearch, block: xr.Dataset) -> xr.Dataset:
     return result.assign_attrs({NO_FIT: min(reasons, default="")})
 
 
-def _judge_samples(values: Float[np.ndarray, "variables samples"], search: PointSearch) -> int:
-    """Status that can be told before a fit; 0 if a fit is worth trying."""
+def _assess_samples(values: Float[np.ndarray, "variables samples"], search: PointSearch) -> int:
+    """Status that can be reported before a fit; 0 if a fit is worth trying."""
     lost = ~np.isfinite(values)
     if lost.all(axis=1).any():
         return STATUSES.index("no_plasma")

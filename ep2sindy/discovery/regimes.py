@@ -1,16 +1,15 @@
 """Regimes of a field: groups of points where the same terms act, their number and certainty.
 
-The pointwise study gives every point its equations. A term's weight at a point is its signed share
-of the equation. Regimes differ by which terms act, as source or sink, so a weight w counts as w |w|
-/ (w^2 + LEAST^2): near 0 well below the share LEAST, near +-1 well above it. The points are
-grouped by a Gaussian mixture of these values. No component is narrower than RESOLUTION or than
+The pointwise study gives every point its equations. A term's weight at a point is its signed
+fraction of the equation. Regimes differ by which terms act, as source or sink, so a weight w counts
+as w |w| / (w^2 + LEAST^2): near 0 well below the fraction LEAST, near +-1 well above it. The points
+are grouped by a Gaussian mixture of these values. No component is narrower than RESOLUTION or than
 the bootstraps' own spread, and Schwarz's criterion decides on the number of components. Neighbours
 are alike and no regime is exact, so with enough points any difference would become significant: the
 likelihood is therefore raised to the power 1 / (1 + n_points / COARSENING). If equations change
 gradually from one regime to another, the points between may still come out as a regime of their
-own.
-Sources: Callaham, Koch, Brunton, Kutz & Brunton 2021, doi:10.1038/s41467-021-21331-z (regimes as
-clusters of the balance between terms); Schwarz 1978, doi:10.1214/aos/1176344136; Miller & Dunson
+own. Sources: Callaham, Koch, Brunton, Kutz & Brunton 2021, doi:10.1038/s41467-021-21331-z (regimes
+as clusters of the balance between terms); Schwarz 1978, doi:10.1214/aos/1176344136; Miller & Dunson
 2019, doi:10.1080/01621459.2018.1469995 (coarsening).
 """
 
@@ -35,7 +34,7 @@ COARSENING = 100.0  # number of points at which evidence stops growing
 
 UNSURE = 0.5  # confidence below which a point counts as unsure
 
-LEAST = 0.1  # share of an equation from which a term acts
+LEAST = 0.1  # fraction of an equation from which a term acts
 
 RESOLUTION = 0.2  # least width of a regime, in activities of terms
 
@@ -48,11 +47,11 @@ class Regimes:
     equations. confidence: same shape, mean probability of the point's regime over the bootstraps;
     NaN where labels are -1.
     table: one row per regime, equation and term. acts: True if the median of |weight| reaches
-    LEAST. in_support: share of the regime's points whose support holds the term. weight: the
+    LEAST. in_support: fraction of the regime's points whose support holds the term. weight: the
     median. coef, coef_low and coef_high: median, 16 % and 84 % of the points that hold the term, in
-    the unit of the column coef_units. n_points, confidence (mean) and unsure (share of the points
-    whose confidence is below UNSURE) are those of the regime.
-    at_limit: True if there are as many regimes as max_regimes allows; the points may support more.
+    the unit of the column coef_units. n_points, confidence (mean) and unsure (fraction of the
+    points whose confidence is below UNSURE) are those of the regime. at_limit: True if there are as
+    many regimes as max_regimes allows; the points may support more.
     """
 
     labels: xr.DataArray
@@ -139,11 +138,10 @@ def group_points(
 ) -> tuple[Int[np.ndarray, " points"], Float[np.ndarray, " points"]]:
     """Regime and confidence of every point; the order of the points does not matter.
 
-    weights: signed shares of all terms in all equations. draws: the same from each bootstrap, NaN
-    if it could not be fitted. The confidence is the probability of the point's regime under the
+    weights: signed fractions of all terms in all equations. draws: the same from each bootstrap,
+    NaN if it could not be fitted. The confidence is the probability of the point's regime under the
     mixture, averaged over the bootstraps. It is low if they disagree or fail, and for a point
-    between two regimes.
-    Raises ValueError unless max_regimes is one or more.
+    between two regimes. Raises ValueError unless max_regimes is one or more.
     """
     rng, _ = np.random.default_rng(rng), check_count("max_regimes", max_regimes)
     known = np.isfinite(draws).all(axis=2)
@@ -164,7 +162,7 @@ def group_points(
 
 
 def _action(weights: np.ndarray) -> np.ndarray:
-    """Activity of a term by its weight: 0 if inactive, +-1/2 at the share LEAST, at most +-1."""
+    """Activity of a term by its weight: 0 if inactive, +-1/2 at the fraction LEAST, at most +-1."""
     return weights * np.abs(weights) / (weights**2 + LEAST**2)
 
 
@@ -189,10 +187,10 @@ def _mixture(
             for n in sizes.tolist()
         ]
     n_effective = len(points) / (1.0 + len(points) / COARSENING)
-    # Each component has a mean, a variance and a share; the shares sum to one.
+    # Each component has a mean, a variance and a fraction; the fractions sum to one.
     n_parameters = sizes * (points.shape[1] + 2) - 1
-    misfit = np.array([-2.0 * mixture.score(points) for mixture in candidates])
-    best = int(np.argmin(n_effective * misfit + n_parameters * np.log(n_effective)))
+    cost = np.array([-2.0 * mixture.score(points) for mixture in candidates])
+    best = int(np.argmin(n_effective * cost + n_parameters * np.log(n_effective)))
     return candidates[best] if best else None
 
 

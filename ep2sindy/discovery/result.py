@@ -26,7 +26,7 @@ from ep2sindy.model.storage import read_as, read_stored
 from ep2sindy.operating.law import OperatingLaw
 from ep2sindy.operating.records import most_central
 from ep2sindy.regression.ambiguity import Ambiguity
-from ep2sindy.regression.front import Candidate, Cloud, LeftOver, ParetoFront
+from ep2sindy.regression.front import Candidate, Ensemble, LeftOver, ParetoFront
 from ep2sindy.runtime.files import write_text
 from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.runtime.screen import N_LINES, one_screen, sentences
@@ -43,14 +43,14 @@ class NoiseTest:
 
     left: for each state, the residuals of its equation on rows. It is empty if no rows were tested,
     as after a trajectory search, which tests whole trajectories.
-    misfit: the reason why the model does not explain the data; empty if it does, or if nothing was
-    tested. tested: False if nothing was tested. n_free: for each state named by a relation that
+    lack_of_fit: the reason why the model does not explain the data; empty if it does, or if nothing
+    was tested. tested: False if nothing was tested. n_free: for each state named by a relation that
     holds in the model, the number of free coefficients of its equation. note: on states without a
     law, which rest or drift; empty if there are none.
     """
 
     left: Mapping[str, LeftOver] = field(default_factory=dict)
-    misfit: str = ""
+    lack_of_fit: str = ""
     tested: bool = False
     n_free: Mapping[str, int] = field(default_factory=dict)
     note: str = ""
@@ -88,7 +88,7 @@ STORED = {
     for kind in (
         Ambiguity,
         Candidate,
-        Cloud,
+        Ensemble,
         Constraint,
         LeftOver,
         NoiseTest,
@@ -107,15 +107,16 @@ class Discovery:
     state, the selected candidate with its coefficients in the model. If the noise of the samples is
     propagated into the rows, these come from a weighted refit. Their covariance is in the model.
     method: that found the model. noise_test: test of the residuals against the noise.
-    ambiguities: terms that these data cannot tell apart, and warnings of too few rows for the
+    ambiguities: terms that these data cannot distinguish, and warnings of too few rows for the
     terms. note: how a rule for whole systems decided, how certain a trajectory search is, or that
     the residuals exceed the noise; else empty. remarks: sentences on where the samples deviate from
     the assumptions (`Estimate.remarks`). estimate: of states and coefficients together, after a
     trajectory search. constraint: that the model's coefficients obey under relations or roles, to
     be handed to `refine`; None without. others: of a rule that runs whole systems, those of as many
-    free coefficients that live as well. points: of runs at several operating points, the discovery
-    at each, by its label, such as "V_D_V=300, mdot_mg_s=5"; model and all else are then those of
-    the most central point. law: of all coefficients over the operating points, if it was asked for.
+    free coefficients that sustain their oscillation as well. points: of runs at several operating
+    points, the discovery at each, by its label, such as "V_D_V=300, mdot_mg_s=5"; model and all
+    else are then those of the most central point. law: of all coefficients over the operating
+    points, if it was asked for.
 
     >>> run = ep.lotka_volterra().trajectory(noise=0.05, rng=0)
     >>> found = ep.discover(run)
@@ -145,12 +146,12 @@ class Discovery:
         return {state: front.scores for state, front in self.fronts.items()}
 
     @property
-    def misfit(self) -> str:
+    def lack_of_fit(self) -> str:
         """The reason why the model does not explain the data to within their noise.
 
         Empty if it does, or if the model was not tested: `noise_test.tested` is then False.
         """
-        return self.noise_test.misfit
+        return self.noise_test.lack_of_fit
 
     def simulate(
         self,
@@ -330,7 +331,8 @@ def _encode(value: Any) -> Any:
     name = type(value).__name__ if type(value) in STORED.values() else place_of(type(value))
     if name is None or not is_dataclass(value):
         raise ValueError(
-            f"a discovery is stored with its method, of classes of this package alone, got {value!r}"
+            "a discovery is stored with its method, of classes of this package alone, got "
+            f"{value!r}"
             "; store its model, found.model.save(path)"
         )
     return {"class": name, **{f.name: _encode(getattr(value, f.name)) for f in fields(value)}}

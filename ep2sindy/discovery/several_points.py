@@ -173,7 +173,7 @@ class PointsTask:
 def choose_law(fits: PointFits, law: LawFunctions | Sequence[LawFunctions]) -> OperatingLaw:
     """The law through the fits of all points, of several the one that errs least where left out.
 
-    Laws whose errors cannot be told apart count as equal, and that of fewest functions is taken.
+    Laws whose errors cannot be distinguished count as equal, and that of fewest functions is taken.
     Raises ValueError if the points do not suffice for any.
     """
     if isinstance(law, int | str | Library):

@@ -1,4 +1,4 @@
-"""What a search costs: its memory and time, told before it begins, and a limit to its time.
+"""What a search costs: its memory and time, reported before it begins, and a limit to its time.
 
 A search that reaches its limit, or is interrupted, ends with the best that it has.
 """
@@ -25,7 +25,7 @@ NUMBERS, PER_TERM = 2.5, 10.0
 SECONDS, MORE_SECONDS = 2.5e-5, 0.8e-8
 # Samples of the parts of a long record that a search with a limit takes first, in blocks.
 PARTS, BLOCKS = tuple(4**k for k in range(7, 16)), 8
-SOON_S = 60.0  # a search that takes longer is told of
+SOON_S = 60.0  # a search that takes longer is stated of
 
 
 class SlowSearch(UserWarning):
@@ -114,7 +114,7 @@ def check_size(
     library: Library,
     terms: Mapping[str, Sequence[str]],
     *,
-    tied: bool = False,
+    coupled: bool = False,
     limit_s: float | None = None,
 ) -> float:
     """Bytes that a search takes per sample. Raises ValueError for more than memory holds.
@@ -129,7 +129,7 @@ def check_size(
     states = runs[0].state_names
     sizes = [len(terms.get(state, library)) for state in states]
     weighed = [
-        size if tied or state in terms else min(size, SMALL)
+        size if coupled or state in terms else min(size, SMALL)
         for state, size in zip(states, sizes, strict=True)
     ]
     n, d, p = sum(run.n_samples for run in runs), len(states), sum(weighed)
@@ -140,7 +140,7 @@ def check_size(
     check_memory(
         fixed + each * (n if limit_s is None else min(n, 2 * PARTS[0])),
         f"{what},",
-        way_out="take fewer terms or a lower degree, every second sample "
+        hint="take fewer terms or a lower degree, every second sample "
         "(ep2sindy.data.decimate), limit_s=60 for a search of parts, or a search equation by "
         "equation: Regression(WeightedWeak()), or search=best_subset selection=ebic",
     )

@@ -17,7 +17,7 @@ from ep2sindy.data.runs import Runs, trajectories_of
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.estimation.cost import SearchMonitor, check_limit_s, check_size, growing_parts
 from ep2sindy.estimation.explanation import Explanation, explain, explain_under_noise
-from ep2sindy.estimation.hidden import Entrance, with_guesses
+from ep2sindy.estimation.hidden import Coupling, with_guesses
 from ep2sindy.estimation.likelihood import Gram, gram, hessian_on
 from ep2sindy.estimation.noise import remark
 from ep2sindy.estimation.observation import Solution
@@ -42,9 +42,11 @@ from ep2sindy.runtime.progress import Progress, as_progress, count_pieces
 from ep2sindy.runtime.values import check_count
 
 MAX_RIVALS = 5
-MIN_ODDS = 1e-3  # rivals with lower odds are not reported
-TOLD = 0.5  # least probability of all supports; with less, the samples do not tell which it is
-EVEN = 0.2  # above these odds of a rival, the choice is reported as undecided
+MIN_ODDS = 1e-3  # rivals with lower posterior odds are not reported
+MIN_PROBABILITY = (
+    0.5  # least probability of all supports; with less, the samples do not tell which it is
+)
+EVEN = 0.2  # above these posterior odds of a rival, the choice is reported as ambiguous
 
 
 @dataclass(frozen=True)
@@ -52,9 +54,9 @@ class ScoredSupport:
     """A support of one equation, the other equations as chosen, with its coefficients and deviance.
 
     coef: term name -> coefficient, in SI.
-    deviance: -2 log likelihood of the trajectories plus the prices of all terms, minus the same of
-    the chosen model. It comes from a linearisation about the chosen model, so it is accurate only
-    for supports whose fit is close to it.
+    deviance: -2 log likelihood of the trajectories plus the penalties of all terms, minus the same
+    of the chosen model. It comes from a linearisation about the chosen model, so it is accurate
+    only for supports whose fit is close to it.
     """
 
     coef: Mapping[str, float]
@@ -68,7 +70,7 @@ class ScoredSupport:
 
 @dataclass(frozen=True)
 class Rival:
-    """Another support of one equation, and its odds against the chosen one; 1 is equally likely."""
+    """Another support of one equation, and its posterior odds against the chosen one."""
 
     state: str
     terms: tuple[str, ...]
@@ -79,23 +81,22 @@ class Rival:
 class Estimate:
     """Result of estimating states and coefficients together.
 
-    model: carries the covariance of its coefficients, unless it is a misfit. runs: as they were
+    model: carries the covariance of its coefficients, unless it does not fit. runs: as they were
     fitted, hidden states as estimated. paths: for each of these runs, the estimated states,
     (samples, d), in SI.
     noise_std: (d,), standard deviation of the samples' noise, in SI; NaN for hidden states. memory:
     (d,), correlation of this noise from one sample to the next, 0 for white noise.
     flow_error: size of the deviation of the states from the model over one sampling step, as a
-    share of the noise; 0 if the residuals are nothing but noise. process_noise_std: (d,), of what
-    moves every state at random over a mean step, in SI; 0 if an exact trajectory explains the
-    samples. misfit: the reason why these equations do not explain the data; empty if they do.
+    fraction of the noise; 0 if the residuals are nothing but noise. process_noise_std: (d,), of
+    what moves every state at random over a mean step, in SI; 0 if an exact trajectory explains the
+    samples. lack_of_fit: the reason why these equations do not explain the data; empty if they do.
     too_few_samples: a remark if they are too few to decide; otherwise empty. explained_states: of a
-    misfit, the states whose equations explain their samples all the same.
-    supports: for each state, the best supports of every size. rivals: other plausible supports, the
-    most likely first.
+    lack of fit, the states whose equations explain their samples all the same. supports: for each
+    state, the best supports of every size. rivals: other plausible supports, the most likely first.
     remarks: sentences on where the samples deviate from the assumptions: limits of sensors, noise
     that is correlated in time, grows with the state or has outliers, and collinear states.
     kurtosis: (d,), of the noise; 3 if it is normal, NaN if every sample is a limit. growth: (d,),
-    share of the noise variance that grows with the state. delays_s: (d,), the delay of each
+    fraction of the noise variance that grows with the state. delays_s: (d,), the delay of each
     channel. `align=True` shifts the channels back into step, and leaves out the samples at the ends
     that this costs. constraint: that the coefficients obey under roles, with the processes found.
     """
@@ -106,7 +107,7 @@ class Estimate:
     noise_std: ByState
     memory: ByState
     flow_error: float
-    misfit: str
+    lack_of_fit: str
     too_few_samples: str
     supports: Mapping[str, Sequence[ScoredSupport]] = field(repr=False)
     rivals: Sequence[Rival]
@@ -121,15 +122,19 @@ class Estimate:
     @property
     def note(self) -> str:
         """The most important remark on the fit, on one line."""
-        if self.misfit:
-            return self.misfit
+        if self.lack_of_fit:
+            return self.lack_of_fit
         if not self.rivals:
-            return self.too_few_samples or "no other support of an equation has odds above 1:1000"
+            return (
+                self.too_few_samples
+                or "no other support of an equation has posterior odds above 1:1000"
+            )
         first = self.rivals[0]
-        odds = f"{first.state}' of {', '.join(first.terms)} at odds of 1:{1.0 / first.odds:.3g}"
+        odds = f"posterior odds of 1:{1.0 / first.odds:.3g}"
+        odds = f"{first.state}' of {', '.join(first.terms)} at {odds}"
         if self.too_few_samples:
             return f"{self.too_few_samples}; next is {odds}"
-        return f"{'not decided' if first.odds > EVEN else 'the next best'}: {odds}"
+        return f"{'ambiguous' if first.odds > EVEN else 'the next best'}: {odds}"
 
 
 def estimate(
@@ -149,14 +154,14 @@ def estimate(
     runs: one run or a list, see `trajectories_of`; all share the coefficients. Samples may be
     spaced unequally. Inputs are taken as exact. max_terms: the most terms of one equation; None
     allows seven, and more where an equation of a large library needs them. align: if True, channels
-    found to be late are shifted forward; if False, late channels make the model a misfit, and their
-    delays are reported.
-    library: with what is known of the equations, as for `discover`. hidden: states that nobody
-    measured, which the library has; all ways in which they may enter are compared. courses: input
-    -> how it goes from one sample to the next, "held", "linear" or "smooth"; of others the
-    likeliest course is taken. limit_s: wall time after which the search ends with the best that it
-    has, and says so; of long records it takes parts first. progress: True shows bars, see
-    `Progress`; an interruption (Ctrl-C) then ends the search in the same way.
+    found to be late are shifted forward; if False, delayed channels count as a lack of fit of the
+    model, and their delays are reported. library: with what is known of the equations, as for
+    `discover`. hidden: states that nobody measured, which the library has; all ways in which they
+    may enter are compared. courses: input -> how it goes from one sample to the next, "held",
+    "linear" or "smooth"; of others the likeliest course is taken. limit_s: wall time after which
+    the search ends with the best that it has, and says so; of long records it takes parts first.
+    progress: True shows bars, see `Progress`; an interruption (Ctrl-C) then ends the search in the
+    same way.
 
     >>> run = ep.lotka_volterra().trajectory(noise=0.05, rng=0)
     >>> found = ep.estimate(run, ep.polynomial(["x", "y"], degree=2))
@@ -172,8 +177,8 @@ def estimate(
         max_terms = check_count("max_terms", max_terms)
     check_limit_s(limit_s)
     facts = task.facts
-    tied = bool(facts.relations or facts.known or facts.roles or task.hidden)
-    bytes_each = check_size(task.runs, task.library, facts.only, tied=tied, limit_s=limit_s)
+    coupled = bool(facts.relations or facts.known or facts.roles or task.hidden)
+    bytes_each = check_size(task.runs, task.library, facts.only, coupled=coupled, limit_s=limit_s)
     watch = as_progress(progress)
     monitor, found, part = SearchMonitor(watch, limit_s), None, task.runs
     settings = _Settings(max_terms, align, courses, monitor)
@@ -193,7 +198,7 @@ def estimate(
     library, constraint = task.library.with_known_terms(task.states), None
     if facts.roles is not None:
         played = compress(answer.solution.problem.processes, answer.solution.fit.free != 0.0)
-        constraint = constraint_of(library, task.states, list(played), facts.roles.told)
+        constraint = constraint_of(library, task.states, list(played), facts.roles.stated)
     model = _model(answer, library, fitted[0].units, provenance or {})
     return replace(_report(answer, model, fitted, watch), constraint=constraint)
 
@@ -220,19 +225,19 @@ def _answer(task: Task, settings: _Settings) -> tuple[Explanation, Sequence[Traj
     tried: list[tuple[Explanation, Sequence[Trajectory]]] = []
     doubtful: list[tuple[Explanation, _Way]] = []
     for group in with_guesses(task):
-        ways = [_Way.of(task, known, entrances, settings) for known, entrances in group]
+        ways = [_Way.of(task, known, couplings, settings) for known, couplings in group]
         for under_noise, way in [(way.begin(settings), way) for way in ways]:
             if not under_noise.solution.fits and np.isfinite(under_noise.solution.deviance):
                 doubtful.append((under_noise, way))
             elif not settings.monitor.ended:
                 tried.append((way.answer(settings, under_noise), way.runs))
-        if settings.monitor.ended or any(not answer.misfit for answer, _ in tried):
+        if settings.monitor.ended or any(not answer.lack_of_fit for answer, _ in tried):
             break
     else:
         for under_noise, way in sorted(doubtful, key=lambda each: each[0].solution.deviance)[:1]:
             few = settings._replace(max_terms=settings.max_terms or FIRST_MAX_TERMS)
             tried.append((way.answer(few, under_noise), way.runs))
-    return min(tried, key=lambda each: (bool(each[0].misfit), each[0].solution.rank))
+    return min(tried, key=lambda each: (bool(each[0].lack_of_fit), each[0].solution.rank))
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,7 +252,7 @@ class _Way:
     words: tuple[str, ...]
 
     @staticmethod
-    def of(task: Task, known: Task, entrances: Sequence[Entrance], settings: _Settings) -> _Way:
+    def of(task: Task, known: Task, couplings: Sequence[Coupling], settings: _Settings) -> _Way:
         """known: the task with guesses of hidden states, which are no states of it."""
         check_runs(known)
         measured = task.runs[0].state_names
@@ -268,12 +273,12 @@ class _Way:
             f"{n_samples - problem.n_samples} of {n_samples} samples are left out: fewer than "
             f"{MIN_SAMPLES} stand together between gaps"
         )
-        words = [lonely] * (problem.n_samples < n_samples) + [each.words for each in entrances]
+        words = [lonely] * (problem.n_samples < n_samples) + [each.words for each in couplings]
         return _Way(problem, known.runs, tuple(words))
 
     def begin(self, settings: _Settings) -> Explanation:
         """Answer under process noise."""
-        return self._told(explain_under_noise(self.problem, max_terms=settings.max_terms))
+        return self._stated(explain_under_noise(self.problem, max_terms=settings.max_terms))
 
     def answer(self, settings: _Settings, under_noise: Explanation | None = None) -> Explanation:
         """Answer by an exact trajectory, if one explains the samples."""
@@ -281,9 +286,9 @@ class _Way:
             self.problem, max_terms=settings.max_terms, align=settings.align,
             under_noise=under_noise,
         )  # fmt: skip
-        return self._told(found)
+        return self._stated(found)
 
-    def _told(self, found: Explanation) -> Explanation:
+    def _stated(self, found: Explanation) -> Explanation:
         return replace(found, remarks=(*self.words, *found.remarks))
 
 
@@ -312,8 +317,8 @@ def _report(
         noise_std=np.where(problem.measured, found.noise.std * problem.scale, np.nan),
         memory=found.noise.memory,
         flow_error=found.flow_error,
-        misfit=answer.misfit,
-        too_few_samples=_say_too_few(problem) or _open_choice(problem, supports),
+        lack_of_fit=answer.lack_of_fit,
+        too_few_samples=_report_too_few(problem) or _open_choice(problem, supports),
         supports=supports,
         rivals=_rivals(problem, found, supports),
         remarks=(*answer.remarks, *remark(problem, found.noise)),
@@ -365,7 +370,7 @@ def _model(
     rows = (C[used][:, fit.support] * problem.to_SI[used, None])[order]
     hessian, cov = hessian_on(fit, fit.support)[0], None
     # If the residuals exceed the noise, intervals would not cover the truth.
-    if found.fits and not answer.misfit and np.isfinite(hessian).all():
+    if found.fits and not answer.lack_of_fit and np.isfinite(hessian).all():
         cov = rows @ invert_gram(hessian) @ rows.T
     courses = dict(zip(problem.inputs, problem.courses, strict=True))
     return SparseModel(library, problem.states, coef, units, provenance, cov, courses=courses)
@@ -379,9 +384,9 @@ def _score_supports(
     if not pair.finite:
         return [ScoredSupport(_named_coef(problem, fit.free, block), 0.0)]
     own = problem.block == block
-    offered = offer_supports(problem, pair, found.prices, fit.support, own)
+    offered = offer_supports(problem, pair, found.penalties, fit.support, own)
     others = [each.support for each in offered if not np.array_equal(each.support, fit.support)]
-    chosen, *rest = (penalise(pair, mask, found.prices) for mask in [fit.support, *others])
+    chosen, *rest = (penalise(pair, mask, found.penalties) for mask in [fit.support, *others])
     rows = [
         ScoredSupport(_named_coef(problem, free, block), max(score - chosen.score, 0.0))
         for free, score in [(fit.free, chosen.score), *((each.free, each.score) for each in rest)]
@@ -401,7 +406,7 @@ def _rivals(
     return tuple(sorted(rivals, key=lambda r: -r.odds)[:MAX_RIVALS])
 
 
-def _say_too_few(problem: EstimationProblem) -> str:
+def _report_too_few(problem: EstimationProblem) -> str:
     if problem.enough_samples or problem.candidates.required.all():  # or all terms are given
         return ""
     n_terms = len(problem.candidates.library)
@@ -417,16 +422,16 @@ def _open_choice(
 ) -> str:
     """A remark if the chosen supports are less likely than all others that were weighed together.
 
-    Prices of terms are log prior odds, so scores give posterior probabilities (Schwarz 1978,
+    Penalties of terms are log prior odds, so scores give posterior probabilities (Schwarz 1978,
     doi:10.1214/aos/1176344136).
     """
-    share = 1.0
+    fraction = 1.0
     for weighed in supports.values():
-        share /= sum(each.odds for each in weighed)
-    if share >= TOLD:
+        fraction /= sum(each.odds for each in weighed)
+    if fraction >= MIN_PROBABILITY:
         return ""
     return (
         f"{problem.n_samples} samples do not tell these equations from others: the chance that all "
-        f"terms are right is {share:.0%}; name the terms that you know (Library.only), take a "
+        f"terms are right is {fraction:.0%}; name the terms that you know (Library.only), take a "
         "smaller library, or a longer record"
     )

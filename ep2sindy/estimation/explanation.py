@@ -1,4 +1,4 @@
-"""What explains the samples: an exact trajectory, channels that come late, or process noise.
+"""What explains the samples: an exact trajectory, channels that lag, or process noise.
 
 Each is a `Solution` under another `Observation`, and the one of least rank is reported. The search
 for an exact trajectory starts from smoothed states. If what it finds does not fit, it starts again
@@ -24,8 +24,8 @@ from ep2sindy.estimation.observation import (
     SURE,
     Solution,
     best_delays,
-    delay_misfit,
-    delay_price,
+    delay_lack_of_fit,
+    delay_penalty,
     delay_words,
     free_delays,
     shift_channels,
@@ -57,13 +57,14 @@ from ep2sindy.trust.interruption import is_interruption
 ADVICE = (
     "Name a hidden state (hidden=[...]), embed one signal (+exp=trace), or measure another state"
 )
-# Model error of the fits that compare courses: an input half a step late shows, with all terms.
+# Model error of the fits that compare courses: an input half a step delayed shows, with all terms.
 COURSES_AT = 0.1
 BETTER = 4.0  # least fall of -2 log likelihood for which the most plausible course is left
 MORE_TERMS = 5  # of one equation, where all allowed are used
-# Moves of late channels (the delay model is linear), and the move, in mean steps, that ends them.
+# Moves of delayed channels (the delay model is linear), and the move, in mean steps, that ends
+# them.
 MAX_MOVES, SETTLED = 3, 0.05
-MAX_WIDER = 500  # terms of a library that a late channel competes with: more would take too long
+MAX_WIDER = 500  # terms of a library that a delayed channel competes with: more would take too long
 # Signs of an unobserved state, see `unobserved_state`.
 CLEAR = 4.0  # steps between the points of a path, in standard deviations of the noise
 MOST_POINTS = 3000  # of a path that is looked at, the first ones
@@ -76,12 +77,12 @@ LEAST_CROSSINGS = 3  # one may come from a gap or an outlier
 class Explanation:
     """The solution that is reported: of the samples as given, or of the aligned ones if asked for.
 
-    misfit: the reason why it does not explain the samples; empty if it does. delays: (d,), in mean
-    steps. remarks: on how the samples were changed or explained.
+    lack_of_fit: the reason why it does not explain the samples; empty if it does. delays: (d,), in
+    mean steps. remarks: on how the samples were changed or explained.
     """
 
     solution: Solution
-    misfit: str
+    lack_of_fit: str
     delays: ByState
     remarks: tuple[str, ...] = ()
 
@@ -121,15 +122,15 @@ def _in_time(problem: EstimationProblem, search: Callable[[], Explanation]) -> E
     try:
         return search()
     except (OutOfTimeError, KeyboardInterrupt, SystemError) as stop:
-        late, interrupted = isinstance(stop, OutOfTimeError), is_interruption(stop)
+        timed_out, interrupted = isinstance(stop, OutOfTimeError), is_interruption(stop)
         # Nobody follows a silent search, which may be one of many: an interruption ends them all.
         watched = interrupted and monitor.progress is not SILENT
-        if monitor.best is None or not (late or watched):
+        if monitor.best is None or not (timed_out or watched):
             if interrupted:
                 raise KeyboardInterrupt("the search was interrupted") from stop
             raise
         monitor.ended = True
-        by = "limit_s" if late else "an interruption"
+        by = "limit_s" if timed_out else "an interruption"
         return _unfinished(monitor.best, f"ended by {by} after {monitor.elapsed_s:.3g} s")
     finally:
         monitor.best = None  # what follows is a report, which nothing ends
@@ -149,11 +150,11 @@ def _unfinished(best: Solution | TrajectoryFit, ended: str) -> Explanation:
 
 
 def _explanation(
-    solution: Solution, misfit: str = "", remarks: tuple[str, ...] = ()
+    solution: Solution, lack_of_fit: str = "", remarks: tuple[str, ...] = ()
 ) -> Explanation:
-    """A solution, which explains the samples unless there is a misfit or a limit to its terms."""
-    misfit = misfit or _at_limit(solution)
-    return Explanation(solution, misfit, solution.observation.delays, remarks)
+    """A solution, which explains the samples unless there does not fit or a limit to its terms."""
+    lack_of_fit = lack_of_fit or _at_limit(solution)
+    return Explanation(solution, lack_of_fit, solution.observation.delays, remarks)
 
 
 def _explain(
@@ -178,23 +179,23 @@ def _explain(
         return _explanation(exact if observed.delays.any() else best, words)
     if observed.delays.any():
         if not align:
-            words = delay_misfit(problem, observed)
+            words = delay_lack_of_fit(problem, observed)
             return replace(_explanation(exact, words), delays=observed.delays)
         words = f"{delay_words(problem, observed)}: brought together with the others"
         return _explanation(best, remarks=(words,))
     if not best.fits:
-        return _explanation(best, _misfit(best))
+        return _explanation(best, _lack_of_fit(best))
     return _explanation(best, remarks=(process_noise_words(best),))
 
 
-def _on_other_courses(problem: EstimationProblem, late: Solution) -> Solution | None:
-    """A solution in which no state is late, with another course of an input; None without any."""
-    taken = late.problem.courses
+def _on_other_courses(problem: EstimationProblem, delayed: Solution) -> Solution | None:
+    """A solution with no delayed state, and another course of an input; None without any."""
+    taken = delayed.problem.courses
     for j, options in enumerate(problem.allowed_courses):
         for course in options:
             if course != taken[j]:
                 courses = (*taken[:j], course, *taken[j + 1 :])
-                found = search_within(late.problem.candidates.on_courses(courses))
+                found = search_within(delayed.problem.candidates.on_courses(courses))
                 if found.fits:
                     return found
     return None
@@ -257,7 +258,7 @@ def _search_by_size(problem: EstimationProblem, *, wider: bool) -> Solution:
 
 
 def _align(found: Solution) -> Solution | None:
-    """A solution with late channels that fits and is likelier; None if there is none.
+    """A solution with delayed channels that fits and is likelier; None if there is none.
 
     Its samples are brought forward by their delays.
     """
@@ -265,28 +266,28 @@ def _align(found: Solution) -> Solution | None:
     # No model follows the samples, or a channel of its own rate cannot be moved onto the others.
     if around is None or (problem.n_measured[problem.measured] < problem.n_samples).any():
         return None
-    step = suspect_delays(problem, around, found.fit.support, found.prices)
+    step = suspect_delays(problem, around, found.fit.support, found.penalties)
     if step is None:
         return None
-    now, late, delays = found, step != 0.0, np.zeros(len(step))
+    now, delayed, delays = found, step != 0.0, np.zeros(len(step))
     for _ in range(MAX_MOVES):
         delays = delays + step
         here = shift_channels(now.problem, now.fit.paths, step)
         if min(len(record.samples) for record in here.records) < MIN_SAMPLES:
             return None  # shifts as long as a record are no delays
-        with problem.monitor.stage("channels that come late"):
+        with problem.monitor.stage("delayed channels"):
             now = from_smooth(here, None)
         if now.around is None:
             return None
-        delayed = free_delays(now.around, late)
-        terms = best_support(here, delayed, now.prices, now.fit.support).support
-        step, errors = best_delays(now.around, terms, late)
+        with_delays = free_delays(now.around, delayed)
+        terms = best_support(here, with_delays, now.penalties, now.fit.support).support
+        step, errors = best_delays(now.around, terms, delayed)
         if np.abs(step).max() < SETTLED:
             break
     # Samples at the ends are left out: scale the likelihood to the full number of samples.
     deviance = now.deviance * problem.n_samples / here.n_samples
-    price = late.sum() * delay_price(problem) + PAYS
-    observation = replace(now.observation, delays=delays, price=price, delay_errors=errors)
+    penalty = delayed.sum() * delay_penalty(problem) + PAYS
+    observation = replace(now.observation, delays=delays, penalty=penalty, delay_errors=errors)
     now = replace(now, observation=observation, deviance=deviance)
     sure = (np.abs(delays) >= SURE * errors).all()
     return now if sure and now.fits and now.score < found.score else None
@@ -299,8 +300,8 @@ def _lacks_terms(found: Solution) -> str:
     higher products also stand in for a delay: they count if there are no more terms of them. A
     solution that explains the samples by anything else has to be likelier.
     """
-    problem, late = found.problem, bool(found.observation.delays.any())
-    wider = _wider(problem, MAX_WIDER if late else SMALL)
+    problem, delayed = found.problem, bool(found.observation.delays.any())
+    wider = _wider(problem, MAX_WIDER if delayed else SMALL)
     if wider is None:
         return ""
     wider = replace(wider, most_terms=problem.most_terms)
@@ -314,12 +315,12 @@ def _lacks_terms(found: Solution) -> str:
         finally:
             problem.monitor.best = found  # whose library is the one asked for
     n_more = better.fit.support.sum() - found.fit.support.sum()
-    if not better.fits or (found.fits and better.score > found.score) or (late and n_more > 0):
+    if not better.fits or (found.fits and better.score > found.score) or (delayed and n_more > 0):
         return ""
     degree = int(wider.library.degrees.max())
     return (
         f"this library lacks terms: with products up to degree {degree} the samples are explained"
-        f"{', and with no channel late' if late else ''}: take {_next_library(problem)}. The "
+        f"{', and with no channel delayed' if delayed else ''}: take {_next_library(problem)}. The "
         "equations are the nearest found"
     )
 
@@ -347,7 +348,7 @@ def _next_library(problem: EstimationProblem) -> str:
     )
 
 
-def _misfit(found: Solution) -> str:
+def _lack_of_fit(found: Solution) -> str:
     """Why a solution does not explain the samples, and what to do."""
     states, explained = found.problem.states, found.explained & found.problem.measured
     tried = _wider(found.problem, SMALL) is not None
@@ -363,7 +364,7 @@ def _misfit(found: Solution) -> str:
         words = (
             "no model of this library fits these data as far as their noise: "
             f"{'; '.join(found.signs)}. The equations are the nearest found; add terms ({more}) or "
-            "states, or judge them by free run"
+            "states, or assess them by free run"
         )
     sign = unobserved_state(found.problem)
     return f"{words}. A state is missing for certain: {sign}. {ADVICE}" if sign else words
@@ -397,7 +398,7 @@ def on_likeliest_courses(problem: EstimationProblem) -> EstimationProblem:
     """The problem with every input on the likeliest of the courses that its samples allow.
 
     They are compared before the search, with all terms: a wrong course would ask for wrong ones,
-    and pass for a state that comes late. Noise is of unknown size, so that n log(squares) counts.
+    and pass for a state that lags. Noise is of unknown size, so that n log(squares) counts.
     """
     if all(len(options) == 1 for options in problem.allowed_courses):
         return problem

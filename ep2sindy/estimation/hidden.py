@@ -1,11 +1,11 @@
 """Hidden states: nobody measured them, and their equations are found along with the others'.
 
 A hidden state shows only in the rates of others, so its scale is free to choose. It is fixed by its
-entrance: a term with which it enters the equation of another state, and that term's coefficient.
-`x' = v` makes v the derivative of x, `x' = x*g` makes g its growth rate. Entrances lead to
+coupling: a term with which it enters the equation of another state, and that term's coefficient.
+`x' = v` makes v the derivative of x, `x' = x*g` makes g its growth rate. Couplings lead to
 different equations, so all that a library allows are tried, and the one of least -2 log likelihood
-plus prices is taken: the samples of a hidden state are missing ones (`likelihood`), and only its
-guess, from the rates of the states before it, differs between entrances. Assumed is that it moves
+plus penalties is taken: the samples of a hidden state are missing ones (`likelihood`), and only its
+guess, from the rates of the states before it, differs between couplings. Assumed is that it moves
 measured states within the record.
 Source: Takens 1981, doi:10.1007/BFb0091924, for why one state can show the others.
 """
@@ -27,10 +27,10 @@ from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Relation, parse_relation
 from ep2sindy.library.units import unit_product
 from ep2sindy.model.model import SparseModel
+from ep2sindy.signals.signal import is_positive
 from ep2sindy.signals.smoothers import KalmanSmoother
-from ep2sindy.signals.trace import is_positive
 
-# Share of a factor's mean square that weighs a hidden state's mean against what its rate tells:
+# Fraction of a factor's mean square that weighs a hidden state's mean against what its rate tells:
 # where the factor is small, this is little.
 LEAST_FACTOR = 0.03
 
@@ -38,7 +38,7 @@ Columns = dict[str, Float[np.ndarray, " samples"]]
 
 
 @dataclass(frozen=True)
-class Entrance:
+class Coupling:
     """A term by which a hidden state enters the equation of another state.
 
     coefficient: of the term, in SI; it fixes the scale of the hidden state. given: True if a
@@ -64,10 +64,10 @@ class Entrance:
         )
 
 
-def entrances(
+def couplings(
     library: Library, measured: Sequence[str], hidden: Sequence[str]
-) -> list[tuple[Entrance, ...]]:
-    """All ways in which hidden states may enter, one entrance for each of them.
+) -> list[tuple[Coupling, ...]]:
+    """All ways in which hidden states may enter, one coupling for each of them.
 
     A hidden state enters the equation of a state before it, alone or times one of these. The first
     one of a single measured state is its rate or its growth rate, and the next one enters the
@@ -81,7 +81,7 @@ def entrances(
             own = _linear_in(library, name, before)
         shown = before[1:] if len(measured) == 1 and len(before) > 1 else before
         offered = [
-            Entrance(name, state, library.names[k])
+            Coupling(name, state, library.names[k])
             for state in shown
             for k in np.flatnonzero(own & (library.degrees <= 2)).tolist()
             if library.allowed(state)[k]
@@ -98,7 +98,7 @@ def entrances(
     return list(product(*choices))
 
 
-def with_guesses(task: Task) -> Iterator[list[tuple[Task, tuple[Entrance, ...]]]]:
+def with_guesses(task: Task) -> Iterator[list[tuple[Task, tuple[Coupling, ...]]]]:
     """Tasks without hidden states, one for every way in: guesses stand among the samples.
 
     They come in groups, the most natural first; the next group counts if no way of it fits. A
@@ -106,7 +106,7 @@ def with_guesses(task: Task) -> Iterator[list[tuple[Task, tuple[Entrance, ...]]]
     that takes either sign has a rate, for no growth rate would let it through zero.
     """
     measured = task.runs[0].state_names
-    found = entrances(task.library, measured, task.hidden)
+    found = couplings(task.library, measured, task.hidden)
     groups = [list(ways) for _, ways in groupby(found, key=lambda ways: ways[0])]
     if len(measured) > 1:
         groups = [found]
@@ -118,7 +118,7 @@ def with_guesses(task: Task) -> Iterator[list[tuple[Task, tuple[Entrance, ...]]]
         yield [(_insert_guesses(task, ways), ways) for ways in group]
 
 
-def _insert_guesses(task: Task, ways: Sequence[Entrance]) -> Task:
+def _insert_guesses(task: Task, ways: Sequence[Coupling]) -> Task:
     """The task with guesses of its hidden states, whose scales are fixed by relations.
 
     The equation of a single measured state has one term, unless others of it are known.
@@ -130,7 +130,7 @@ def _insert_guesses(task: Task, ways: Sequence[Entrance]) -> Task:
     return Task([with_guess(run, library, ways) for run in task.runs], library)
 
 
-def with_guess(run: Trajectory, library: Library, ways: Sequence[Entrance]) -> Trajectory:
+def with_guess(run: Trajectory, library: Library, ways: Sequence[Coupling]) -> Trajectory:
     """A run with a first guess of its hidden states.
 
     Each one explains what a regression on the states before it leaves of the rate that it enters.
@@ -249,17 +249,17 @@ def _fixed_by(
     library: Library,
     own: Bool[np.ndarray, " terms"],
     before: Sequence[str],
-) -> Entrance | None:
-    """The entrance whose coefficient a relation fixes; None if it fixes none."""
+) -> Coupling | None:
+    """The coupling whose coefficient a relation fixes; None if it fixes none."""
     if len(relation.factors) != 1 or not relation.value:
         return None
     factor, state, term = relation.factors[0]
     if state not in before or not own[library.index(term)]:
         return None
-    return Entrance(hidden, state, term, relation.value / factor, given=True)
+    return Coupling(hidden, state, term, relation.value / factor, given=True)
 
 
-def _unit(way: Entrance, library: Library, units: Mapping[str, str]) -> str:
+def _unit(way: Coupling, library: Library, units: Mapping[str, str]) -> str:
     """Unit of a hidden state whose term has a coefficient without unit."""
     factor = library.terms[library.index(way.term)].unit({**units, way.hidden: "1"})
     return unit_product([(units[way.state], 1), ("s", -1), (factor, -1)])

@@ -46,17 +46,17 @@ from ep2sindy.regression.gram_kernels import invert_gram
 
 FREE_START = 100.0  # prior variance of the first state: ten times its RMS, squared
 HELD_START = 1e-24  # the same of one that starts at zero
-MAX_STEPS, SHORTEST = 10, 1e-3  # Gauss-Newton steps of one fit; the least share of a step tried
+MAX_STEPS, SHORTEST = 10, 1e-3  # Gauss-Newton steps of one fit; the least fraction of a step tried
 # Rate at which paths diverge, in nats per sample; chaotic systems that are resolved reach 0.3.
 MAX_DIVERGENCE = 1.0
-SETTLED = 1e-2  # a fall of the squares that ends the fit; a term's price is about ten
-# Give up on a fit with mean square above FAR that falls by less than this share per step.
+SETTLED = 1e-2  # a fall of the squares that ends the fit; a term's penalty is about ten
+# Give up on a fit with mean square above FAR that falls by less than this fraction per step.
 FAR, CRAWLS = 10.0, 0.02
 RIDGE = 1e-12  # added to a Hessian of unit diagonal
 # Samples that resolve the motion never need more substeps. Runaway coefficients may ask for more,
 # and each substep costs as much as the first.
 MAX_SUBSTEPS, MIN_ALLOWED, MAX_IN_ALL = 32, 4, 20_000
-SUBSTEP_ERROR = 0.1  # RMS error of the substeps, as a share of the flow's
+SUBSTEP_ERROR = 0.1  # RMS error of the substeps, as a fraction of the flow's
 FAR_OUT = 1e3  # distance beyond a limit, in noise, from which the limit acts as a value
 TELLS = 1e-3  # weight, relative to a value's, below which limits carry no information
 LOG_ROOT_2PI = 0.5 * log(2.0 * pi)
@@ -67,7 +67,7 @@ class TrajectoryFit:
     """States and coefficients of a problem, fitted under some noise and error of the flow.
 
     noise: standard deviations of the samples of all records, scaled. model_error: of the flow, as a
-    share of the noise. path: states at the samples of all records, one after the other, scaled.
+    fraction of the noise. path: states at the samples of all records, one after the other, scaled.
     free: zero outside the support. n_substeps: Runge-Kutta steps between two samples.
     process_noise: the flow's error itself, if it is known. at_zero: states that start at zero, and
     would start below it; None for none.
@@ -167,10 +167,10 @@ class Gram:
     def minimise(self, over: Bool[np.ndarray, " z"]) -> Gram:
         """The least squares over some of the unknowns, as a function of the rest."""
         rest, inverse = ~over, invert_gram(self.quadratic[np.ix_(over, over)])
-        share = self.quadratic[np.ix_(rest, over)] @ inverse
+        fraction = self.quadratic[np.ix_(rest, over)] @ inverse
         return Gram(
-            self.quadratic[np.ix_(rest, rest)] - share @ self.quadratic[np.ix_(over, rest)],
-            self.linear[rest] - share @ self.linear[over],
+            self.quadratic[np.ix_(rest, rest)] - fraction @ self.quadratic[np.ix_(over, rest)],
+            self.linear[rest] - fraction @ self.linear[over],
             self.offset - float(self.linear[over] @ inverse @ self.linear[over]),
         )
 
@@ -227,17 +227,17 @@ def _descend(fit: TrajectoryFit) -> TrajectoryFit:
         step = _step(fit)
         if step is None:
             return fit  # derivatives overflow before the flow itself does
-        (change, move), share = step, 1.0
-        while share > SHORTEST:
-            tried = replace(fit, path=fit.path + share * move, free=fit.free + share * change)
+        (change, move), fraction = step, 1.0
+        while fraction > SHORTEST:
+            tried = replace(fit, path=fit.path + fraction * move, free=fit.free + fraction * change)
             if tried.total < fit.total:
                 break
-            share /= 2.0
+            fraction /= 2.0
         else:
             return fit
         gain, fit = fit.total - tried.total, tried
         crawls = fit.total > FAR * fit.problem.n_squares and gain < CRAWLS * fit.total
-        if crawls or (share == 1.0 and gain < SETTLED):
+        if crawls or (fraction == 1.0 and gain < SETTLED):
             return fit
     return fit
 
@@ -273,8 +273,10 @@ def divergence_rate(fit: TrajectoryFit) -> float:
     about, _, logs = innovations(fit)
     precision = np.where(np.isfinite(about.residuals), 1.0 / about.variance, 0.0)
     by_record = np.add.reduceat(precision, np.append(0, fit.problem.all_records.breaks + 1))
-    told = logs + np.log(precision[precision > 0.0]).sum() - np.log1p(FREE_START * by_record).sum()
-    return max(float(told), 0.0) / fit.problem.n_samples
+    stated = (
+        logs + np.log(precision[precision > 0.0]).sum() - np.log1p(FREE_START * by_record).sum()
+    )
+    return max(float(stated), 0.0) / fit.problem.n_samples
 
 
 def innovations(fit: TrajectoryFit) -> tuple[Linearised, float, float]:

@@ -19,15 +19,15 @@ from ep2sindy.runtime.screen import joined
 
 # A record in pieces of different lengths, by sample and state.
 Pieces = Sequence[Float[np.ndarray, "_ d"]]
-OtherPieces = Sequence[Float[np.ndarray, "_ _"]]  # of other states than those that are judged
+OtherPieces = Sequence[Float[np.ndarray, "_ _"]]  # of other states than those that are assessed
 
-FLOOR = 1e-3  # least noise, as a share of the RMS: no model and no integration is exact
+FLOOR = 1e-3  # least noise, as a fraction of the RMS: no model and no integration is exact
 SIGNIFICANT = 3.5  # standard errors of an autocorrelation
 MAX_LASTING = 0.98
-SLOW, LARGE = 0.9, 0.3  # autocorrelation, and share of the spread, that no noise has together
+SLOW, LARGE = 0.9, 0.3  # autocorrelation, and fraction of the spread, that no noise has together
 ALIKE = 7.0  # tolerance of the log mean square of differences, which scatters by 2.15/sqrt(n)
 LONGER = 6.0  # tolerance of autocorrelations, which scatter by up to 1.7/sqrt(n)
-NOISE_SHARES = 2.0 ** np.arange(-6.0, 1.1, 0.25)  # of the residuals' RMS, tried for limits
+NOISE_FRACTIONS = 2.0 ** np.arange(-6.0, 1.1, 0.25)  # of the residuals' RMS, tried for limits
 LAGS = (2, 3, 4, 5, 6)
 CHANCE = 1e-5  # that noise holds a line as clean as one that is called the model's error
 # A state that lasts about its rest has a law: x' = -k x under process noise is AR(1), too. So what
@@ -40,17 +40,27 @@ BEFORE = (1, 2)
 # with; and standard errors by which these may explain more of random residuals than their number.
 MORE_DEGREES, MAX_POWERS, FOLLOWS = 2, 60, 6.0
 TINY = float(np.finfo(np.float64).tiny)
-SHARES = (0.1, 0.3, 0.5, 0.7, 0.9, 0.97, 0.99, 0.999, 0.9999)  # of growing variance, tried in turn
+FRACTIONS = (
+    0.1,
+    0.3,
+    0.5,
+    0.7,
+    0.9,
+    0.97,
+    0.99,
+    0.999,
+    0.9999,
+)  # of growing variance, tried in turn
 GROWTH_SHOWS = 12.0  # least gain in 2 log likelihood for noise that grows
 OUTLYING = 5.0  # standard deviations
 ORDER = 3  # of differences, which remove most of a signal that the samples resolve
-MODEL_ERRORS = (1e-3, 1e-2, 0.03, 0.1, 0.3)  # of the flow, as shares of the noise
+MODEL_ERRORS = (1e-3, 1e-2, 0.03, 0.1, 0.3)  # of the flow, as fractions of the noise
 # Prior, worth this many samples: the noise is alike in all states. Without it, for few samples,
 # the likeliest model follows one state exactly and ignores another.
 ALIKE_SAMPLES = 5.0
 HEAVY, STANDARD_ERRORS = 4.0, 5.0  # least kurtosis reported; least excess over 3
 COLLINEAR = 5.0  # standard errors by which a variance may exceed that of noise
-PART = 0.05  # share of the largest part: states with less are left out of a relation
+PART = 0.05  # fraction of the largest part: states with less are left out of a relation
 ERROR_SHOWS = 2.0  # least gain in 2 log likelihood for a flow with error
 
 
@@ -63,7 +73,7 @@ class Noise:
     correlation from one sample to the next if the noise is correlated in time, else 0. unexplained:
     (d,), the same correlation if the samples themselves do not show such noise: then it is the
     model's error. patterned: (d,), True if the residuals hold a clean line or are a function of the
-    states, which is the model's error too. growth: (d,), share of the
+    states, which is the model's error too. growth: (d,), fraction of the
     variance that grows with the state. kurtosis: (d,), 3 for normal noise, NaN if all samples are
     limits. outliers: (d,), number of samples off by more than five standard deviations, estimated
     from the median. deviance: -2 log likelihood of the residuals.
@@ -97,7 +107,7 @@ class Noise:
 
     @property
     def independent(self) -> ByState:
-        """Effective share of independent samples."""
+        """Effective fraction of independent samples."""
         return (1.0 - self.memory) / (1.0 + self.memory)
 
 
@@ -114,7 +124,7 @@ def noise_beside(fit: TrajectoryFit) -> Noise:
     sizes = np.sqrt(np.mean([np.square(path).mean(axis=0) for path in fit.paths], axis=0))
     std[hidden] = std[~hidden].mean() * sizes[hidden]
     shape, growth = _shape(problem, fit.path, left)
-    # The shape is told by values at all samples.
+    # The shape is stated by values at all samples.
     untold = limited | hidden | (n < problem.n_samples)
     shape, growth = np.where(untold, 1.0, shape), np.where(untold, 0.0, growth)
     if limited.any():
@@ -197,8 +207,8 @@ def _chance_foretold(samples: OtherPieces, left: Pieces, n_before: int) -> BySta
         return np.ones(own.shape[1])
     own = own - own.mean(axis=0)
     basis = np.linalg.qr(before - before.mean(axis=0))[0]
-    share = np.square(basis.T @ own).sum(axis=0) / np.maximum(np.square(own).sum(axis=0), TINY)
-    ratio = share / p / np.maximum(1.0 - share, TINY) * (n - p - 1)
+    fraction = np.square(basis.T @ own).sum(axis=0) / np.maximum(np.square(own).sum(axis=0), TINY)
+    ratio = fraction / p / np.maximum(1.0 - fraction, TINY) * (n - p - 1)
     return np.asarray(fdtrc(p, n - p - 1, ratio))
 
 
@@ -221,7 +231,7 @@ def _likeliest_std(fit: TrajectoryFit, std: ByState) -> tuple[ByState, ByState]:
     """
     record, path = fit.problem.all_records, fit.path
     n_values = np.isfinite(record.values).sum(axis=0)
-    tried = np.maximum(NOISE_SHARES[:, None] * std, FLOOR)
+    tried = np.maximum(NOISE_FRACTIONS[:, None] * std, FLOOR)
     variances = (np.broadcast_to(np.square(each), path.shape) for each in tried)
     squares = [observe(record, path, variance).squares.sum(axis=0) for variance in variances]
     deviance = n_values * (np.log(np.square(tried)) - 1.0) + np.array(squares)
@@ -258,10 +268,10 @@ def _shape(problem: EstimationProblem, path: BySample, left: BySample) -> tuple[
     # Squares of correlated noise are correlated too: fewer of them are independent.
     square = np.square(_memory(problem.split(left)))
     shows = GROWTH_SHOWS * (1.0 + square) / (1.0 - square)
-    shares = np.array([0.0, *SHARES])
-    deviance = np.array([_growth_deviance(1.0 - w + w * relative, e2) for w in shares])
+    fractions = np.array([0.0, *FRACTIONS])
+    deviance = np.array([_growth_deviance(1.0 - w + w * relative, e2) for w in fractions])
     deviance[0] -= shows
-    growth = shares[deviance.argmin(axis=0)]
+    growth = fractions[deviance.argmin(axis=0)]
     return np.sqrt(1.0 - growth + growth * relative), growth
 
 
@@ -322,7 +332,7 @@ def _hold_line(times: Sequence[Float[np.ndarray, " _"]], new: Pieces, chance: fl
     """True if whitened residuals hold a cleaner line than noise: the model ignores an oscillation.
 
     chance: that noise holds one in any of the pieces. Of white residuals the m
-    ordinates of a periodogram are alike: the largest has more than a share g of their sum with a
+    ordinates of a periodogram are alike: the largest has more than a fraction g of their sum with a
     probability of at most m (1 - g)^(m - 1).
     Source: Fisher 1929, doi:10.1098/rspa.1929.0151.
     """
@@ -333,8 +343,8 @@ def _hold_line(times: Sequence[Float[np.ndarray, " _"]], new: Pieces, chance: fl
         placed = np.zeros((place[-1] + 1, each.shape[1]))
         np.add.at(placed, place, each)
         power = np.square(np.abs(np.fft.rfft(placed, axis=0)[1 : (len(placed) + 1) // 2]))
-        share = power.max(axis=0, initial=0.0) / np.maximum(power.sum(axis=0), TINY)
-        held |= len(power) * (1.0 - share) ** (len(power) - 1) < chance / len(new)
+        fraction = power.max(axis=0, initial=0.0) / np.maximum(power.sum(axis=0), TINY)
+        held |= len(power) * (1.0 - fraction) ** (len(power) - 1) < chance / len(new)
     return held
 
 
@@ -351,8 +361,8 @@ def _follow_states(fit: TrajectoryFit, new: Pieces) -> StateMask:
 def excess_explained(columns: Float[np.ndarray, "samples columns"], residuals: BySample) -> ByState:
     """How much more columns explain of residuals than of random ones, in standard errors.
 
-    The squares that random residuals share with the columns are expected from the squares of each
-    sample alone, so neither outliers nor noise that grows with the state pass for a function.
+    The squares that random residuals fraction with the columns are expected from the squares of
+    each sample alone, so neither outliers nor noise that grows with the state pass for a function.
     """
     basis = np.linalg.qr(columns)[0]
     shared = np.square(basis.T @ residuals).sum(axis=0)

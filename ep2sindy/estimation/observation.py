@@ -1,12 +1,12 @@
 """How states show themselves in the samples, and solutions under such an observation.
 
-Of a state that comes late, a delay is one more parameter of how it is sampled:
+The delay of a state that lags is one more parameter of how it is sampled:
 
     y_k(t) = x_k(t - tau_k) + noise, about x_k(t) - tau_k x_k'(t) + noise
 
 With a delayed channel, wrong equations with more terms fit the data no worse. So the delays are not
 read from the residuals. They are unknowns beside the coefficients, and are believed if the squares
-plus the prices of terms and delays fall: fewer terms then suffice, or likelier ones. Assumed is
+plus the penalties of terms and delays fall: fewer terms then suffice, or likelier ones. Assumed is
 that each delay is constant, and short beside the times on which the states change; without inputs
 a delay that all states share leaves no trace.
 """
@@ -31,8 +31,8 @@ from ep2sindy.estimation.problem import (
 from ep2sindy.estimation.supports import best_support, penalise
 from ep2sindy.regression.gram_kernels import invert_gram
 
-IGNORED = 0.5  # residual, as a share of a state's spread, if the model ignores the state
-PAYS = 1.0  # least fall of squares plus prices, beyond the delays' own price
+IGNORED = 0.5  # residual, as a fraction of a state's spread, if the model ignores the state
+PAYS = 1.0  # least fall of squares plus penalties, beyond the delays' own penalty
 SURE = 6.0  # standard errors of every delay: true ones of a sample show ten and more
 HALF_WIDTH = 1.96  # standard errors of an interval of 95 %
 MAX_SAMPLES = 10.0  # largest delay that is believed: more is no small clock error
@@ -46,14 +46,14 @@ class Observation:
 
     Of y a record has the value, a pair of limits, or nothing (`ScaledRecord`), whatever the other
     parts are. delays: (d,), in mean steps. process: (d,), scaled; zero for an exact trajectory.
-    price: of the parameters that are not zero, on the scale of -2 log likelihood. delay_errors:
+    penalty: of the parameters that are not zero, on the scale of -2 log likelihood. delay_errors:
     (d,), standard errors of the delays; None without any.
     """
 
     noise: Noise
     delays: ByState
     process: ByState
-    price: float = 0.0
+    penalty: float = 0.0
     delay_errors: ByState | None = None
 
 
@@ -78,17 +78,17 @@ class LackOfFit:
 class Solution:
     """The likeliest support that one search has found, under one observation of the states.
 
-    Solutions are compared by -2 log likelihood + prices of terms + price of the observation,
+    Solutions are compared by -2 log likelihood + penalties of terms + penalty of the observation,
     after what they explain (`rank`).
 
-    prices: of the free coefficients. deviance: -2 log likelihood of the samples. tests: all that
-    the fit must pass. flow_error: size of the deviations from the flow, as a share of the noise.
+    penalties: of the free coefficients. deviance: -2 log likelihood of the samples. tests: all that
+    the fit must pass. flow_error: size of the deviations from the flow, as a fraction of the noise.
     around: linearisation with delays, where the support was compared with others.
     """
 
     fit: TrajectoryFit
     observation: Observation
-    prices: ByCoefficient
+    penalties: ByCoefficient
     deviance: float
     tests: tuple[LackOfFit, ...]
     flow_error: float = 0.0
@@ -104,10 +104,12 @@ class Solution:
 
     @property
     def score(self) -> float:
-        """-2 log likelihood plus prices, comparable between solutions."""
+        """-2 log likelihood plus penalties, comparable between solutions."""
         if not np.isfinite(self.fit.total):
             return inf
-        return self.deviance + float(self.prices[self.fit.support].sum()) + self.observation.price
+        return (
+            self.deviance + float(self.penalties[self.fit.support].sum()) + self.observation.penalty
+        )
 
     @property
     def explained(self) -> StateMask:
@@ -166,65 +168,65 @@ def without_delays(around: Gram, n: int) -> Gram:
     return around.select(np.arange(len(around.linear)) < n)
 
 
-def free_delays(around: Gram, late: StateMask) -> Gram:
+def free_delays(around: Gram, delayed: StateMask) -> Gram:
     """The squares as a function of the coefficients, minimised over some states' delays."""
-    n = len(around.linear) - len(late)
-    own = around.select(np.append(np.ones(n, dtype=np.bool_), late))
+    n = len(around.linear) - len(delayed)
+    own = around.select(np.append(np.ones(n, dtype=np.bool_), delayed))
     return own.minimise(np.arange(len(own.linear)) >= n)
 
 
-def best_delays(around: Gram, support: Support, late: StateMask) -> tuple[ByState, ByState]:
+def best_delays(around: Gram, support: Support, delayed: StateMask) -> tuple[ByState, ByState]:
     """Best delays of some states jointly with the terms of a support, and their standard errors."""
-    own = around.select(np.append(support, late))
+    own = around.select(np.append(support, delayed))
     own = own.minimise(np.arange(len(own.linear)) < support.sum())
     inverse = invert_gram(own.quadratic)
-    delays, errors = np.zeros((2, len(late)))
-    delays[late] = inverse @ own.linear
-    errors[late] = np.sqrt(np.maximum(np.diag(inverse), 0.0))
+    delays, errors = np.zeros((2, len(delayed)))
+    delays[delayed] = inverse @ own.linear
+    errors[delayed] = np.sqrt(np.maximum(np.diag(inverse), 0.0))
     return delays, errors
 
 
 def suspect_delays(
-    problem: EstimationProblem, around: Gram, support: Support, prices: ByCoefficient
+    problem: EstimationProblem, around: Gram, support: Support, penalties: ByCoefficient
 ) -> ByState | None:
     """Delays by state, in mean steps, that make fewer or likelier terms suffice; None if none."""
-    late = problem.measured.copy()
-    late[np.argmax(late)] = problem.driven  # without inputs the first state sets the clock
-    if not (late.any() and free_delays(around, late).finite):
+    delayed = problem.measured.copy()
+    delayed[np.argmax(delayed)] = problem.driven  # without inputs the first state sets the clock
+    if not (delayed.any() and free_delays(around, delayed).finite):
         return None
-    best = best_support(problem, free_delays(around, late), prices, support)
-    here = penalise(without_delays(around, len(support)), support, prices)
+    best = best_support(problem, free_delays(around, delayed), penalties, support)
+    here = penalise(without_delays(around, len(support)), support, penalties)
     gain = here.score - best.score
-    if gain < delay_price(problem) + PAYS:
+    if gain < delay_penalty(problem) + PAYS:
         return None
-    delays = _significant_delays(problem, around, best.support, late)
-    gain -= np.count_nonzero(delays) * delay_price(problem)
+    delays = _significant_delays(problem, around, best.support, delayed)
+    gain -= np.count_nonzero(delays) * delay_penalty(problem)
     return delays if gain > PAYS and 0.0 < np.abs(delays).max() <= MAX_SAMPLES else None
 
 
-def delay_price(problem: EstimationProblem) -> float:
+def delay_penalty(problem: EstimationProblem) -> float:
     """Price of a delay: that of a coefficient, chosen among as many as there are channels."""
     return log(problem.n_samples) + 2.0 * log(problem.measured.sum())
 
 
 def _significant_delays(
-    problem: EstimationProblem, around: Gram, support: Support, late: StateMask
+    problem: EstimationProblem, around: Gram, support: Support, delayed: StateMask
 ) -> ByState:
-    """Delays that each pay for themselves: of as few states as possible, late rather than early."""
+    """Delays that each pay for themselves: of as few states as possible, lags rather than leads."""
     if not problem.driven:
-        delays, _ = best_delays(around, support, late)
+        delays, _ = best_delays(around, support, delayed)
         measured = np.flatnonzero(problem.measured)
         order = measured[np.argsort(delays[measured], kind="stable")]
-        late = problem.measured & (np.arange(len(late)) != order[(len(order) - 1) // 2])
-    while late.any():
-        delays, errors = best_delays(around, support, late)
+        delayed = problem.measured & (np.arange(len(delayed)) != order[(len(order) - 1) // 2])
+    while delayed.any():
+        delays, errors = best_delays(around, support, delayed)
         # Zero if rounding leaves no error to compare with.
         shown = np.square(delays / np.where(errors > 0.0, errors, np.inf))
-        shown[~late] = np.inf
+        shown[~delayed] = np.inf
         if shown.min() > SURE**2:
             return delays
-        late = late & (np.arange(len(late)) != int(np.argmin(shown)))
-    return np.zeros(len(late))
+        delayed = delayed & (np.arange(len(delayed)) != int(np.argmin(shown)))
+    return np.zeros(len(delayed))
 
 
 def shift_channels(
@@ -235,7 +237,7 @@ def shift_channels(
     A sample moves along the fitted path beside it and keeps its distance, so its noise stays white.
     Samples that would lie beyond either end are left out.
     """
-    from scipy.interpolate import CubicSpline  # imported only if channels are late
+    from scipy.interpolate import CubicSpline  # imported only if channels lag
 
     records = []
     for record, path in zip(problem.records, paths, strict=True):
@@ -251,11 +253,11 @@ def shift_channels(
 
 
 def delay_words(problem: EstimationProblem, observed: Observation) -> str:
-    """Delays in words, `z comes 0.0033 s late (0.99 ± 0.02 samples)`, for every delayed state."""
-    assert observed.delay_errors is not None  # of states that come late
+    """Delays in words, `z lags by 0.0033 s (0.99 ± 0.02 samples)`, for every delayed state."""
+    assert observed.delay_errors is not None  # of delayed states
     errors = HALF_WIDTH * observed.delay_errors
     parts = [
-        f"{state} comes {abs(delay) * problem.step_s:.3g} s {'late' if delay > 0.0 else 'early'} "
+        f"{state} {'lags' if delay > 0.0 else 'leads'} by {abs(delay) * problem.step_s:.3g} s "
         f"({abs(delay):.2f} ± {error:.1g} samples)"
         for state, delay, error in zip(problem.states, observed.delays, errors, strict=True)
         if delay
@@ -263,8 +265,8 @@ def delay_words(problem: EstimationProblem, observed: Observation) -> str:
     return " and ".join(parts)
 
 
-def delay_misfit(problem: EstimationProblem, observed: Observation) -> str:
-    """Explanation why samples with a late channel are a misfit, and what to do about it."""
+def delay_lack_of_fit(problem: EstimationProblem, observed: Observation) -> str:
+    """Explanation why samples with a delayed channel do not fit, and what to do about it."""
     return (
         f"{delay_words(problem, observed)}: brought together, the samples are better explained "
         "by other equations; ask for those by ep.TrajectorySearch(align=True), in configs "

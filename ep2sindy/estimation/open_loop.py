@@ -26,7 +26,7 @@ RUNS_AWAY = 10.0  # distance from the middle of the path, in halves of its range
 # some percent; a wrong cycle is off by more.
 OFF = 1.5
 COUNTED = 0.5  # standard deviations on either side of the mean that a counted turn passes
-STRAYS = "run freely from its first state the model dies out, runs away or turns at another pace"
+STRAYS = "run freely from its first state the model decays, runs away or turns at another pace"
 Runs = Float[np.ndarray, "samples runs d"]
 
 

@@ -38,13 +38,13 @@ SAMPLES_PER_COEFFICIENT = 10  # of an equation, if samples are few: more terms w
 
 @dataclass(frozen=True, eq=False)
 class ScaledRecord:
-    """A trajectory, or a stretch of it between gaps, in scaled variables.
+    """A trajectory, or a segment of it between gaps, in scaled variables.
 
     times: (samples,), and steps: (samples - 1,), in units of the mean step. samples: (samples, d).
     inputs: at the samples, and their courses between them, see `model.inputs`. limits: between
     which the true values lie; both are the sample itself unless it was clipped or rounded. missing:
     (samples, d), true where nothing was measured, as for all of a hidden state; the samples there
-    are nothing but a start. run: number of the run that it is a stretch of. parts: the records of
+    are nothing but a start. run: number of the run that it is a segment of. parts: the records of
     which this one is made, one after the other; none for most.
     """
 
@@ -84,10 +84,10 @@ class ScaledRecord:
         """The samples, with NaN in place of limits and of missing samples."""
         return np.where(self.limits.at | self.missing, np.nan, self.samples)
 
-    def stretches(self) -> list[ScaledRecord]:
-        """The stretches between gaps, which no step of the flow may cross; or all, if it has none.
+    def segments(self) -> list[ScaledRecord]:
+        """The segments between gaps, which no step of the flow may cross; or all, if it has none.
 
-        Stretches of under five samples are left out. If these hold more than half of the samples,
+        Segments of under five samples are left out. If these hold more than half of the samples,
         the long steps are the way in which the record was sampled, and no gaps.
         """
         pieces, n = between_gaps(self.times), len(self.times)
@@ -125,17 +125,17 @@ class ScaledRecord:
         steps[self.breaks] = 0.0
         return steps
 
-    def inputs_at(self, share: float) -> Float[np.ndarray, "steps n_inputs"]:
-        """Inputs at a given share of every step."""
-        rows = [(part.curve.at(share), part.inputs[-1:]) for part in self.parts]
+    def inputs_at(self, fraction: float) -> Float[np.ndarray, "steps n_inputs"]:
+        """Inputs at a given fraction of every step."""
+        rows = [(part.curve.at(fraction), part.inputs[-1:]) for part in self.parts]
         return np.concatenate([each for pair in rows for each in pair])[:-1]
 
     def divided(self, n_substeps: int) -> Steps:
         """The steps, each divided into equal substeps."""
-        shares = np.linspace(0.0, 1.0, 2 * n_substeps + 1)
-        inputs = np.zeros((len(shares), len(self.steps), 0))
+        fractions = np.linspace(0.0, 1.0, 2 * n_substeps + 1)
+        inputs = np.zeros((len(fractions), len(self.steps), 0))
         if self.inputs.shape[1]:
-            inputs = np.array([self.inputs_at(share) for share in shares.tolist()])
+            inputs = np.array([self.inputs_at(fraction) for fraction in fractions.tolist()])
         return Steps(self.steps / n_substeps, inputs)
 
     @cached_property
@@ -150,10 +150,10 @@ class EstimationProblem:
 
     The problem is to find the free coefficients z, most of them zero, and the states x that make
 
-        -2 log likelihood of the samples (`likelihood`) + sum of prices of the terms (`supports`)
+        -2 log likelihood of the samples (`likelihood`) + sum of penalties of the terms (`supports`)
 
     least, in variables of unit size: states over their RMS, time over the mean step. Assumed is
-    that the library holds the law. The prices are those of the Bayesian information criterion.
+    that the library holds the law. The penalties are those of the Bayesian information criterion.
     Source: Schwarz 1978, doi:10.1214/aos/1176344136; Chen & Chen 2008, doi:10.1093/biomet/asn034.
 
     Without relations and roles all coefficients are free: C is None, and fixed is zero. Under roles
@@ -165,7 +165,7 @@ class EstimationProblem:
     relation fixes has its value to the last digit.
     required: (free,), coefficients that are never left out. to_SI: (coefficients,), factors from
     scaled coefficients to SI. scale: (d,), RMS of the states in SI; step_s: the unit of time.
-    measured: (d,), False for hidden states. monitor: told of every step of a fit. whole: the
+    measured: (d,), False for hidden states. monitor: informed of every step of a fit. whole: the
     problem with all terms, if this one has only those of a working set; places: (coefficients,),
     their positions in it. most_terms: asked for of one equation. allowed_courses: of each input,
     the most plausible first. widen: makes the problem with all products of one degree more.
@@ -259,9 +259,9 @@ class EstimationProblem:
         )
 
     def of(self, runs: Sequence[Trajectory]) -> EstimationProblem:
-        """The problem with the stretches of these runs as its records."""
+        """The problem with the segments of these runs as its records."""
         whole = [self.record(run, number) for number, run in enumerate(runs)]
-        return replace(self, records=tuple(part for each in whole for part in each.stretches()))
+        return replace(self, records=tuple(part for each in whole for part in each.segments()))
 
     @cached_property
     def all_records(self) -> ScaledRecord:
@@ -419,15 +419,15 @@ def _rms(runs: Sequence[Trajectory], names: Sequence[str]) -> Float[np.ndarray, 
 def _allow_courses(
     runs: Sequence[Trajectory], inputs: Sequence[str], courses: Mapping[str, str]
 ) -> dict[str, tuple[str, ...]]:
-    """Courses of every input that its samples allow, or the one that is told."""
-    told = {name: (course,) for name, course in check_courses(courses, inputs).items()}
-    return {n: plausible_courses([run.columns([n]) for run in runs]) for n in inputs} | told
+    """Courses of every input that its samples allow, or the one that is stated."""
+    stated = {name: (course,) for name, course in check_courses(courses, inputs).items()}
+    return {n: plausible_courses([run.columns([n]) for run in runs]) for n in inputs} | stated
 
 
 def by_run(
     problem: EstimationProblem, paths: Sequence[np.ndarray], runs: Sequence[Trajectory]
 ) -> Iterator[tuple[Trajectory, BySample]]:
-    """Each run as it was fitted, and its path in SI: the stretches of a run with gaps together.
+    """Each run as it was fitted, and its path in SI: the segments of a run with gaps together.
 
     Its samples are those that were fitted, the estimated path of hidden states among them.
     """

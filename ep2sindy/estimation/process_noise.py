@@ -35,17 +35,17 @@ from ep2sindy.estimation.solver import (
     start_from_smooth,
     with_open_loop,
 )
-from ep2sindy.estimation.supports import term_prices
+from ep2sindy.estimation.supports import term_penalties
 
 # Bounds on noise and process noise, in RMS of the states.
 LEAST_NOISE, LEAST_PROCESS, MOST = 1e-5, 1e-7, 3.0
 MAX_TRIALS = 120  # likelihoods per size of an error
-SHARES = (0.3, 1.0, 1.0, 1.0, 1.0)  # of the terms' prices, in every round
+FRACTIONS = (0.3, 1.0, 1.0, 1.0, 1.0)  # of the terms' penalties, in every round
 LAGS = range(1, 9)  # at which innovations are correlated with themselves
 # Standard errors that random innovations may show: see `_test_innovations`.
 MOST_SHOWN = (5.0, 4.0, 6.0)
-COLLINEAR = 1e-3  # share of a product that is left beside an equation's terms, if it is another
-LASTING = "what pushes {state} at random is not random"
+COLLINEAR = 1e-3  # fraction of a product that is left beside an equation's terms, if it is another
+LASTING = "the process noise of {state} is not random"
 RUNAWAY = 1e6  # innovations, in RMS of the states, of a model that follows no samples
 # RMS defect of a step, in process noise: the likeliest is smaller than the true one.
 MAX_DEFECT = 3.0
@@ -88,10 +88,10 @@ def likely_errors(fit: TrajectoryFit) -> tuple[ByState, ByState, float]:
 def solve_with_process_noise(problem: EstimationProblem) -> Solution:
     """Errors and sparse coefficients in turn, from smoothed states with all coefficients free."""
     fit = start_from_smooth(problem, None)
-    std, prices = fit.noise[0], term_prices(problem, float(problem.n_samples))
+    std, penalties = fit.noise[0], term_penalties(problem, float(problem.n_samples))
     fit = fit.with_errors(np.maximum(std, LEAST_NOISE), np.maximum(std, 1e-3))
-    for share in SHARES:
-        fit = exchange_terms(refit(fit), share * prices)
+    for fraction in FRACTIONS:
+        fit = exchange_terms(refit(fit), fraction * penalties)
         std, process, deviance = likely_errors(fit)
         fit = fit.with_errors(std, process)
     fit = refit(fit)
@@ -100,7 +100,7 @@ def solve_with_process_noise(problem: EstimationProblem) -> Solution:
     solution = Solution(
         fit=fit,
         observation=Observation(explained, none, process),
-        prices=prices,
+        penalties=penalties,
         # Squares of innovations, scaled to their best size, are as many as samples.
         deviance=deviance - problem.n_squares,
         tests=(_test_defects(fit), *_test_innovations(fit)),
@@ -116,7 +116,9 @@ def _test_defects(fit: TrajectoryFit) -> LackOfFit:
     defects = fit.squared_defects / len(fit.path)
     allowed = MAX_DEFECT**2 * fit.process[0] + np.square(EXACT * fit.noise[0])
     size = np.where(fit.has_law, np.sqrt(defects / allowed), np.inf)
-    return LackOfFit(size, 1.0, "{state} does not follow its equation, not even under pushes")
+    return LackOfFit(
+        size, 1.0, "{state} does not follow its equation, not even under process noise"
+    )
 
 
 def process_noise_words(solution: Solution) -> str:
@@ -133,8 +135,8 @@ def process_noise_words(solution: Solution) -> str:
 def _test_innovations(fit: TrajectoryFit) -> list[LackOfFit]:
     """What innovations show that random ones would not, in standard errors.
 
-    Their largest autocorrelation over a few lags, the largest share that one product of states
-    explains beside the terms of the equation, and the share that all of them explain: what an
+    Their largest autocorrelation over a few lags, the largest fraction that one product of states
+    explains beside the terms of the equation, and the fraction that all of them explain: what an
     equation lacks is a function of the states, and lasts as long as these.
     """
     problem, found = fit.problem, np.nan_to_num(filter_states(*linearise(fit))[0])
@@ -145,11 +147,15 @@ def _test_innovations(fit: TrajectoryFit) -> list[LackOfFit]:
     lasting = np.sqrt(len(joined)) * np.abs(autocorrelations(new, LAGS)).max(axis=0)
     before = np.concatenate([path[SETTLING - 1 : -1] for path in fit.paths])
     powers = powers_of(before, int(problem.candidates.library.degrees.max()) + MORE_DEGREES)
-    shown = lasting, _largest_share(fit, before, powers, joined), excess_explained(powers, joined)
+    shown = (
+        lasting,
+        _largest_fraction(fit, before, powers, joined),
+        excess_explained(powers, joined),
+    )
     return [LackOfFit(each, most, LASTING) for each, most in zip(shown, MOST_SHOWN, strict=True)]
 
 
-def _largest_share(
+def _largest_fraction(
     fit: TrajectoryFit, before: BySample, powers: Float[np.ndarray, "samples _"], new: BySample
 ) -> ByState:
     """The most that one of the powers explains of innovations beside an equation's terms."""

@@ -41,18 +41,25 @@ from ep2sindy.estimation.problem import (
     EstimationProblem,
     ScaledRecord,
 )
-from ep2sindy.estimation.supports import alternatives, best_support, excess, penalise, term_prices
+from ep2sindy.estimation.supports import (
+    alternatives,
+    best_support,
+    excess,
+    penalise,
+    term_penalties,
+)
 from ep2sindy.signals.smoothers import KalmanEstimate, KalmanSmoother
 
 ENOUGH_SAMPLES = 300  # to trust the first start; with fewer, trying all starts is cheap
 # Smoother settings (log10 of process to measurement noise) to try if no other start fits.
 OTHER_STARTS = (-2.0, 0.0, 2.0)
 MAX_PASSES = 4  # until noise and support agree; usually two
-# Model errors, and the share of a term's price charged there. Free states hide part of what a term
-# explains, and a term dropped too early would have to be found again.
+# Model errors, and the fraction of a term's penalty charged there. Free states hide part of what a
+# term explains, and a term dropped too early would have to be found again.
 CONTINUATION = ((0.3, 0.2), (0.1, 0.4), (0.03, 0.7), (0.01, 1.0), (0.003, 1.0), (0.001, 1.0))
 NEARLY_EXACT = ((0.1, 1.0), (0.03, 1.0), (0.003, 1.0), (0.0001, 1.0))
-# RMS defect of the flow of a hidden state, as a share of its steps, beyond which it follows none.
+# RMS defect of the flow of a hidden state, as a fraction of its steps, beyond which it follows
+# none.
 MAX_HIDDEN_DEFECT = 0.1
 # RMS defect of a step, in noise, from which the path is no trajectory: right models have 1e-5.
 EXACT = 1e-3
@@ -60,11 +67,11 @@ MAX_EXCHANGES = 3  # exchanges of supports at one level
 # Model error at which supports are compared again. At a lower one the linearised flow says too
 # little about other supports; at a higher one free states hide their differences.
 COMPARED_AT = 0.003
-# Model error, and the share of the prices, at which another support may show that the solution is a
-# wrong optimum; and by how much it must explain more of the squares.
+# Model error, and the fraction of the penalties, at which another support may show that the
+# solution is a wrong optimum; and by how much it must explain more of the squares.
 RELAXED, EXPLAINS_MORE = (1.0, 0.5), 4.0
 WITHIN, MAX_TRIED, MAX_ROUNDS = 12.0, 6, 6  # score above the chosen one; supports per round; rounds
-UNSURE = 0.05  # share of the RMS: least noise at a start where the smoother's is not trusted
+UNSURE = 0.05  # fraction of the RMS: least noise at a start where the smoother's is not trusted
 FINITE = float(np.finfo(np.float64).max)
 LASTS = "what is left of {state} lasts ({value:.2f} from sample to sample)"
 CUTOFF = 1e-8  # of singular values of unit columns: smaller ones fit noise
@@ -85,41 +92,41 @@ def settle(
 
     Continues again until noise and support agree, and compares with what is nearly as likely.
     """
-    prices = term_prices(start.problem, float(start.problem.n_samples))
-    fit = fit_by_continuation(start, prices, schedule)
+    penalties = term_penalties(start.problem, float(start.problem.n_samples))
+    fit = fit_by_continuation(start, penalties, schedule)
     for _ in range(MAX_PASSES):
         before, noise = fit.support, noise_beside(fit)
-        prices = _prices_beside(fit, noise)
+        penalties = _penalties_beside(fit, noise)
         fit = replace(fit, noise=noise.effective)
-        fit = fit_by_continuation(fit, prices, NEARLY_EXACT)
+        fit = fit_by_continuation(fit, penalties, NEARLY_EXACT)
         if np.array_equal(before, fit.support):
             break
-    fit, around = polish(fit, prices)
-    fit, around = restart_relaxed(fit, around, prices)
+    fit, around = polish(fit, penalties)
+    fit, around = restart_relaxed(fit, around, penalties)
     noise, error, divergence = noise_beside(fit), 0.0, 0.0
     if np.isfinite(fit.total) and (noise.std > FLOOR).any():
         error = flow_error(fit, noise)
         squares = fit.squared_defects / np.square(noise.std)
         defect = float(np.sqrt(squares.max() / len(fit.path)))
-        error = error if defect < EXACT else max(error, defect)  # it lives on the slack
+        error = error if defect < EXACT else max(error, defect)  # it is due to the slack
         divergence = divergence_rate(replace(fit, noise=noise.white))
-    found = replace(_exact_solution(fit, noise, prices, error, divergence), around=around)
+    found = replace(_exact_solution(fit, noise, penalties, error, divergence), around=around)
     return with_open_loop(found) if found.fits else found
 
 
-def _prices_beside(fit: TrajectoryFit, noise: Noise) -> ByCoefficient:
-    """Prices of the terms for samples whose noise is correlated in time."""
-    return term_prices(fit.problem, fit.problem.n_samples * float(noise.independent.mean()))
+def _penalties_beside(fit: TrajectoryFit, noise: Noise) -> ByCoefficient:
+    """Penalties of the terms for samples whose noise is correlated in time."""
+    return term_penalties(fit.problem, fit.problem.n_samples * float(noise.independent.mean()))
 
 
 def unfinished_solution(fit: TrajectoryFit) -> Solution:
     """What a search that was ended on its way has, whose states still leave the flow."""
     noise = noise_beside(fit)
-    return _exact_solution(fit, noise, _prices_beside(fit, noise), fit.model_error, 0.0)
+    return _exact_solution(fit, noise, _penalties_beside(fit, noise), fit.model_error, 0.0)
 
 
 def _exact_solution(
-    fit: TrajectoryFit, noise: Noise, prices: np.ndarray, error: float, divergence: float
+    fit: TrajectoryFit, noise: Noise, penalties: np.ndarray, error: float, divergence: float
 ) -> Solution:
     """The solution of a trajectory without process noise, and its tests."""
     none = np.zeros(len(noise.std))
@@ -140,7 +147,7 @@ def _exact_solution(
     return Solution(
         fit=fit,
         observation=Observation(noise, none, none),
-        prices=prices,
+        penalties=penalties,
         deviance=noise.deviance,
         tests=tuple(LackOfFit(*test) for test in tests),
         flow_error=error,
@@ -151,7 +158,7 @@ def with_open_loop(found: Solution) -> Solution:
     """The solution with one test more: whether its model keeps the motion by itself.
 
     Its runs begin as far from the path as an exact one may miss its steps. Under process noise runs
-    without it count as well: pushes that are not new at every step would add up to more.
+    without it count as well: noise that is not new at every step would add up to more.
     """
     noise, process = found.noise.std, found.observation.process
     test = try_open_loop(found.fit, noise, process, start=EXACT * noise)
@@ -161,40 +168,40 @@ def with_open_loop(found: Solution) -> Solution:
 
 
 def hidden_defects(fit: TrajectoryFit) -> ByState:
-    """RMS defect of the flow of hidden states, as a share of their steps; zero for measured ones.
+    """RMS defect of the flow of hidden states, relative to their steps; zero for measured ones.
 
     One that has become very small leaves the flow freely, and large coefficients make it count.
     """
     with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
         steps = np.diff(fit.path, axis=0)
         steps[fit.problem.all_records.breaks] = 0.0
-        share = np.sqrt(fit.squared_defects / np.square(steps).sum(axis=0))
-        share = np.where(fit.squared_defects > 0.0, share, fit.squared_defects)
-    return np.where(fit.problem.measured, 0.0, share)
+        fraction = np.sqrt(fit.squared_defects / np.square(steps).sum(axis=0))
+        fraction = np.where(fit.squared_defects > 0.0, fraction, fit.squared_defects)
+    return np.where(fit.problem.measured, 0.0, fraction)
 
 
-def _penalised(fit: TrajectoryFit, prices: ByCoefficient) -> float:
-    """The squares plus the prices of the terms, which decide between supports at one level."""
-    return float(fit.total + prices[fit.support].sum())
+def _penalised(fit: TrajectoryFit, penalties: ByCoefficient) -> float:
+    """The squares plus the penalties of the terms, which decide between supports at one level."""
+    return float(fit.total + penalties[fit.support].sum())
 
 
 def fit_by_continuation(
-    fit: TrajectoryFit, prices: ByCoefficient, schedule: Sequence[tuple[float, float]]
+    fit: TrajectoryFit, penalties: ByCoefficient, schedule: Sequence[tuple[float, float]]
 ) -> TrajectoryFit:
-    """Fit level by level; at each level, exchange terms as long as squares plus prices fall.
+    """Fit level by level; at each level, exchange terms as long as squares plus penalties fall.
 
     The noise is that of the fit.
     """
     monitor, fit = fit.problem.monitor, replace(fit, n_substeps=1, process_noise=None)
-    for model_error, share in schedule:
+    for model_error, fraction in schedule:
         fit = refit(replace(fit, model_error=model_error))
-        fit = exchange_terms(fit, share * prices)
+        fit = exchange_terms(fit, fraction * penalties)
         if not isinstance(monitor.best, Solution):
             monitor.best = fit
     return fit
 
 
-def polish(fit: TrajectoryFit, prices: ByCoefficient) -> tuple[TrajectoryFit, Gram | None]:
+def polish(fit: TrajectoryFit, penalties: ByCoefficient) -> tuple[TrajectoryFit, Gram | None]:
     """Refit each support that is nearly as likely by the linear model, and keep a likelier one.
 
     Returns the linearisation in which none is likelier too; None if it tells nothing, as about a
@@ -206,18 +213,18 @@ def polish(fit: TrajectoryFit, prices: ByCoefficient) -> tuple[TrajectoryFit, Gr
     fit = refit(fit)
     tried = {fit.support.tobytes()}
     for _ in range(MAX_ROUNDS):
-        warm = refit(replace(fit, model_error=COMPARED_AT))
-        around = delayed_gram(warm)
+        precompile = refit(replace(fit, model_error=COMPARED_AT))
+        around = delayed_gram(precompile)
         at_rest = without_delays(around, problem.n_free)
         if not (at_rest.finite and np.isfinite(fit.total)):
             break
-        others = alternatives(problem, at_rest, prices, warm.support, within=WITHIN)
+        others = alternatives(problem, at_rest, penalties, precompile.support, within=WITHIN)
         others = [each for each in others if each.support.tobytes() not in tried]
         for each in others[:MAX_TRIED]:
             tried.add(each.support.tobytes())
-            other = refit(replace(warm, support=each.support, free=each.free))
+            other = refit(replace(precompile, support=each.support, free=each.free))
             other = refit(replace(other, model_error=fit.model_error))
-            if _is_likelier(other, fit, prices):
+            if _is_likelier(other, fit, penalties):
                 fit = other
                 break
         else:
@@ -225,17 +232,18 @@ def polish(fit: TrajectoryFit, prices: ByCoefficient) -> tuple[TrajectoryFit, Gr
     return fit, None
 
 
-def _is_likelier(fit: TrajectoryFit, than: TrajectoryFit, prices: ByCoefficient) -> bool:
-    """True if a fit is likelier, prices included, and does not live on steering its path."""
+def _is_likelier(fit: TrajectoryFit, than: TrajectoryFit, penalties: ByCoefficient) -> bool:
+    """True if a fit is likelier, penalties included, and not by steering its path."""
     return (
-        _penalised(fit, prices) < _penalised(than, prices) and divergence_rate(fit) < MAX_DIVERGENCE
+        _penalised(fit, penalties) < _penalised(than, penalties)
+        and divergence_rate(fit) < MAX_DIVERGENCE
     )
 
 
 def restart_relaxed(
-    fit: TrajectoryFit, around: Gram | None, prices: ByCoefficient
+    fit: TrajectoryFit, around: Gram | None, penalties: ByCoefficient
 ) -> tuple[TrajectoryFit, Gram | None]:
-    """Continue again if states that are let go show a better support; the likelier of both.
+    """Continue again if states that are relaxed show a better support; the likelier of both.
 
     Exchanges between nearly exact flows cannot leave a wrong optimum of many terms. Free states
     hide part of what a term explains, so a support counts as better there only if it explains more
@@ -243,9 +251,9 @@ def restart_relaxed(
     """
     if not fit.total < FAR * fit.problem.n_squares:
         return fit, around
-    model_error, share = RELAXED
+    model_error, fraction = RELAXED
     relaxed = refit(replace(fit, model_error=model_error))
-    pair, cheap = gram(relaxed), share * prices
+    pair, cheap = gram(relaxed), fraction * penalties
     if not pair.finite:
         return fit, around
     here = penalise(pair, relaxed.support, cheap)
@@ -255,9 +263,9 @@ def restart_relaxed(
     if n_more > 0 or gain < EXPLAINS_MORE:
         return fit, around
     start = replace(relaxed, support=other.support, free=other.free)
-    again = fit_by_continuation(start, prices, (*CONTINUATION, NEARLY_EXACT[-1]))
-    again, beside = polish(again, prices)
-    return (again, beside) if _is_likelier(again, fit, prices) else (fit, around)
+    again = fit_by_continuation(start, penalties, (*CONTINUATION, NEARLY_EXACT[-1]))
+    again, beside = polish(again, penalties)
+    return (again, beside) if _is_likelier(again, fit, penalties) else (fit, around)
 
 
 def refit(fit: TrajectoryFit) -> TrajectoryFit:
@@ -268,19 +276,19 @@ def refit(fit: TrajectoryFit) -> TrajectoryFit:
     return fit_paths(fit)
 
 
-def exchange_terms(fit: TrajectoryFit, prices: ByCoefficient) -> TrajectoryFit:
-    """Exchange terms by the Gram matrix, refit, and accept any fall of squares plus prices."""
+def exchange_terms(fit: TrajectoryFit, penalties: ByCoefficient) -> TrajectoryFit:
+    """Exchange terms by the Gram matrix, refit, and accept any fall of squares plus penalties."""
     problem = fit.problem
     for _ in range(MAX_EXCHANGES):
-        pair, score = gram(fit), _penalised(fit, prices)
+        pair, score = gram(fit), _penalised(fit, penalties)
         if not (pair.finite and np.isfinite(score)):
             break
-        found = best_support(problem, pair, prices, fit.support)
+        found = best_support(problem, pair, penalties, fit.support)
         if np.array_equal(found.support, fit.support):
             break
         tried = fit_paths(replace(fit, support=found.support, free=found.free))
         too_large = excess(problem, fit.support) > 0
-        if not (_penalised(tried, prices) < score or (too_large and np.isfinite(tried.total))):
+        if not (_penalised(tried, penalties) < score or (too_large and np.isfinite(tried.total))):
             break
         fit = tried
     return fit

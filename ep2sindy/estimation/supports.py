@@ -1,4 +1,4 @@
-"""Choice of supports of all equations, from one Gram matrix and the prices of the terms."""
+"""Choice of supports of all equations, from one Gram matrix and the penalties of the terms."""
 
 from __future__ import annotations
 
@@ -17,33 +17,32 @@ from ep2sindy.regression.searches import exchange_terms, find_best_subsets
 
 MAX_SWEEPS = 10  # over the equations; two or three usually suffice
 # Weight of the cost of choosing among terms. Below 0.5 there are more false terms than true ones
-# are gained, above 1 the reverse: `python -m benchmarks.estimation prices`.
+# are gained, above 1 the reverse: `python -m benchmarks.estimation penalties`.
 GAMMA = 1.0
 PROVEN_TERMS = 7  # of one equation; larger supports are the best that exchanges find
 # Multiplications for a proof, some milliseconds. A choice is made a hundred times on the way, and
 # where a proof takes longer, exchanges from the best so far find nearly always the same.
 MOST_WORK = 3e6
-N_BEST = 4  # supports of each size of an equation, since terms of one size differ in price
+N_BEST = 4  # supports of each size of an equation, since terms of one size differ in penalty
 MAX_ALTERNATIVES = 24  # supports of one equation for which the others are searched again
 
 
 @dataclass(frozen=True, eq=False)
 class PenalisedFit:
-    """A support, the best free coefficients on it, and its squares plus the prices of its terms."""
+    """A support, the best free coefficients on it, and its squares plus the penalties."""
 
     support: Support
     free: ByCoefficient
     score: float
 
 
-def term_prices(problem: EstimationProblem, n_samples: float) -> ByCoefficient:
+def term_penalties(problem: EstimationProblem, n_samples: float) -> ByCoefficient:
     """Price of each coefficient: the fall of the squares that justifies it.
 
-    The price is log n plus a cost of choosing among terms. A term of degree q is one of d C(d + q,
-    q), and every degree above the first is half as likely a priori as the one below; a constant is
-    no simpler than a variable.
-    Source: Schwarz 1978, doi:10.1214/aos/1176344136, for log n; Chen & Chen 2008,
-    doi:10.1093/biomet/asn034, for the count.
+    The penalty is log n plus a cost of choosing among terms. A term of degree q is one of d C(d +
+    q, q), and every degree above the first is half as likely a priori as the one below; a constant
+    is no simpler than a variable. Source: Schwarz 1978, doi:10.1214/aos/1176344136, for log n; Chen
+    & Chen 2008, doi:10.1093/biomet/asn034, for the count.
     """
     degrees = np.maximum(problem.degrees, 1)
     every = problem.candidates.degrees
@@ -54,7 +53,7 @@ def term_prices(problem: EstimationProblem, n_samples: float) -> ByCoefficient:
 def best_support(
     problem: EstimationProblem,
     gram: Gram,
-    prices: ByCoefficient,
+    penalties: ByCoefficient,
     start: Support,
     *,
     held: int | None = None,
@@ -69,16 +68,16 @@ def best_support(
         negative = int((each.free[problem.positive] < 0.0).sum())
         return negative, excess(problem, each.support), each.score
 
-    best = penalise(gram, start, prices)
+    best = penalise(gram, start, penalties)
     for _ in range(MAX_SWEEPS):
         before = best
         for block in np.unique(problem.block):
             own = problem.block == block
             if block == held or problem.required[own].all():
                 continue
-            offered = offer_supports(problem, gram, prices, best.support, own)
+            offered = offer_supports(problem, gram, penalties, best.support, own)
             first = min(offered, key=lambda each: each.score)
-            best = min([best, penalise(gram, first.support, prices)], key=rank)
+            best = min([best, penalise(gram, first.support, penalties)], key=rank)
         if best is before:
             return best
     return best
@@ -91,32 +90,37 @@ def excess(problem: EstimationProblem, support: Support) -> int:
 
 
 def alternatives(
-    problem: EstimationProblem, gram: Gram, prices: ByCoefficient, chosen: Support, *, within: float
+    problem: EstimationProblem,
+    gram: Gram,
+    penalties: ByCoefficient,
+    chosen: Support,
+    *,
+    within: float,
 ) -> list[PenalisedFit]:
     """Supports whose score lies no further than `within` above the chosen one's, best first.
 
     Each takes another support of one equation, and the best ones of the others given that. So they
     include exchanges in two equations that pay only together.
     """
-    limit = penalise(gram, chosen, prices).score + within
+    limit = penalise(gram, chosen, penalties).score + within
     found: dict[bytes, PenalisedFit] = {}
     for block in np.unique(problem.block).tolist():
-        offered = offer_supports(problem, gram, prices, chosen, problem.block == block)
+        offered = offer_supports(problem, gram, penalties, chosen, problem.block == block)
         near = [
             each
             for each in sorted(offered, key=lambda each: each.score)
             if each.score <= limit + within and not np.array_equal(each.support, chosen)
         ]
         for other in near[:MAX_ALTERNATIVES]:
-            each = best_support(problem, gram, prices, other.support, held=block)
+            each = best_support(problem, gram, penalties, other.support, held=block)
             if each.score <= limit and excess(problem, each.support) == 0:
                 found[each.support.tobytes()] = each
     found.pop(chosen.tobytes(), None)
     return sorted(found.values(), key=lambda each: each.score)
 
 
-def penalise(gram: Gram, support: Support, prices: ByCoefficient) -> PenalisedFit:
-    """Least squares on a support, and their score: the squares plus its terms' prices."""
+def penalise(gram: Gram, support: Support, penalties: ByCoefficient) -> PenalisedFit:
+    """Least squares on a support, and their score: the squares plus its terms' penalties."""
     free = np.zeros(len(support))
     quadratic, linear = gram.quadratic[np.ix_(support, support)], gram.linear[support]
     inverse = invert_gram(quadratic)
@@ -124,18 +128,18 @@ def penalise(gram: Gram, support: Support, prices: ByCoefficient) -> PenalisedFi
     # One step of iterative refinement; directions below the cutoff stay out.
     free[support] += inverse @ (linear - quadratic @ free[support])
     rest = gram.offset - 2.0 * gram.linear @ free + free @ gram.quadratic @ free
-    return PenalisedFit(support, free, float(rest + prices[support].sum()))
+    return PenalisedFit(support, free, float(rest + penalties[support].sum()))
 
 
 class Offered(NamedTuple):
-    """A support, and the squares that it leaves plus the prices of its terms."""
+    """A support, and the squares that it leaves plus the penalties of its terms."""
 
     support: Support
     score: float
 
 
 def offer_supports(
-    problem: EstimationProblem, gram: Gram, prices: ByCoefficient, chosen: Support, own: Support
+    problem: EstimationProblem, gram: Gram, penalties: ByCoefficient, chosen: Support, own: Support
 ) -> list[Offered]:
     """The best few supports of every size of one equation, the other equations as chosen.
 
@@ -147,7 +151,7 @@ def offer_supports(
     rest = gram.select(either).minimise(kept[either])
     xx, xy, yy = rest.quadratic, rest.linear, max(rest.offset, 1.0)
     if not own.any():
-        return [Offered(kept, yy + prices[kept].sum())]
+        return [Offered(kept, yy + penalties[kept].sum())]
     # A column that the kept ones span leaves only rounding: it is not available.
     square = np.diag(xx).copy()
     square[~(square > DEPENDENT * np.abs(np.diag(gram.quadratic)[own]))] = 0.0
@@ -169,12 +173,12 @@ def offer_supports(
     for mask, gain in zip(masks, _gains(unit, target, masks), strict=True):
         support = kept.copy()
         support[own] = mask
-        found.append(Offered(support, yy - gain + prices[support].sum()))
-    return _admit(problem, gram, prices, found) if problem.positive.any() else found
+        found.append(Offered(support, yy - gain + penalties[support].sum()))
+    return _admit(problem, gram, penalties, found) if problem.positive.any() else found
 
 
 def _admit(
-    problem: EstimationProblem, gram: Gram, prices: ByCoefficient, offered: Sequence[Offered]
+    problem: EstimationProblem, gram: Gram, penalties: ByCoefficient, offered: Sequence[Offered]
 ) -> list[Offered]:
     """The supports on which coefficients that must be positive are.
 
@@ -183,11 +187,11 @@ def _admit(
     found = {}
     for each in offered:
         support = each.support
-        if (penalise(gram, support, prices).free[problem.positive] < 0.0).any():
+        if (penalise(gram, support, penalties).free[problem.positive] < 0.0).any():
             own, quadratic = np.flatnonzero(support), gram.quadratic[np.ix_(support, support)]
             kept = within_bounds(quadratic, gram.linear[support], problem.positive[support])
             support = np.isin(np.arange(len(support)), own[kept])
-            each = Offered(support, penalise(gram, support, prices).score)
+            each = Offered(support, penalise(gram, support, penalties).score)
         found[support.tobytes()] = each
     return list(found.values())
 

@@ -1,8 +1,8 @@
 """The working set: the few terms of each equation that a search weighs, out of a large library.
 
-The first set comes from each equation by itself: its own state is let go, the others are taken from
-their smoothed samples. After the search every term j outside is tested on what the solution leaves,
-and enters if its score test promises more than its price:
+The first set comes from each equation by itself: its own state is relaxed, the others are taken
+from their smoothed samples. After the search every term j outside is tested on what the solution
+leaves, and enters if its score test promises more than its penalty:
 
     (dS/dz_j)^2 / (4 variance of dS/(2 dz_j)) > price_j
 
@@ -46,7 +46,7 @@ from ep2sindy.estimation.solver import (
     settle,
     smooth_states,
 )
-from ep2sindy.estimation.supports import N_BEST, term_prices
+from ep2sindy.estimation.supports import N_BEST, term_penalties
 from ep2sindy.regression.gram_kernels import invert_gram
 from ep2sindy.regression.searches import exchange_terms
 
@@ -54,7 +54,7 @@ from ep2sindy.regression.searches import exchange_terms
 # terms.
 FIRST_MODEL_ERRORS = (0.3, 3.0)
 MOST_ADMITTED, MAX_ADMISSIONS = 3, 4  # terms of one equation that enter at once; times that some do
-DEPENDENT = 1e-6  # share of a score's scatter that the chosen terms leave, if they span the term
+DEPENDENT = 1e-6  # fraction of a score's scatter that the chosen terms leave, if they span the term
 N_PROBES = 40  # draws of noise that tell how far a score scatters: to 22 % of its square
 
 
@@ -165,8 +165,8 @@ def _integrals(problem: EstimationProblem, path: BySample) -> Float[np.ndarray, 
     record = problem.all_records
     with np.errstate(over="ignore", invalid="ignore"):
         ends = [
-            problem.library.evaluate(np.concatenate([states, record.inputs_at(share)], axis=1))
-            for states, share in ((path[:-1], 0.0), (path[1:], 1.0))
+            problem.library.evaluate(np.concatenate([states, record.inputs_at(fraction)], axis=1))
+            for states, fraction in ((path[:-1], 0.0), (path[1:], 1.0))
         ]
         integrals = 0.5 * record.steps[:, None] * (ends[0] + ends[1])
     return np.where(np.isfinite(integrals).all(axis=0), integrals, 0.0)
@@ -196,7 +196,7 @@ def _own_squares(
 
 
 def _would_pay(problem: EstimationProblem, kept: Support, found: Solution) -> Support:
-    """Terms that would lower the squares by more than their price, at most a few per equation.
+    """Terms that would lower the squares by more than their penalty, at most a few per equation.
 
     Score tests: the derivative of the squares by each coefficient, against its scatter if the
     samples were the solution and noise. Draws of such noise pass through the same linear fit of
@@ -207,7 +207,7 @@ def _would_pay(problem: EstimationProblem, kept: Support, found: Solution) -> Su
     if kept.all() or not np.isfinite(found.score):
         return enters
     fit = refit(replace(found.fit, model_error=COMPARED_AT))
-    gains = _gains(problem, fit) - term_prices(problem, float(problem.n_samples))
+    gains = _gains(problem, fit) - term_penalties(problem, float(problem.n_samples))
     gains[kept] = -np.inf
     for block in range(len(problem.states)):
         own = np.flatnonzero((problem.block == block) & (gains > 0.0))

@@ -13,7 +13,7 @@ from matplotlib.ticker import MaxNLocator
 from ep2sindy.figures import style
 from ep2sindy.figures.style import COLOURS, GREY, SMALL, TITLE
 from ep2sindy.library.equations import latex_derivative, latex_term_name
-from ep2sindy.regression.front import Candidate, Cloud, ParetoFront
+from ep2sindy.regression.front import Candidate, Ensemble, ParetoFront
 
 # Smaller errors are rounding or zero; they are drawn at FLOOR, on a labelled line.
 FLOOR = 1e-12
@@ -68,9 +68,9 @@ _LAYERS = ("all supports fitted", "runners-up", "best of size", "selected")
 def _draw_front(ax: Axes, front: ParetoFront, chosen: int | None) -> None:
     """Draw all supports, runners-up, the best of every size (line) and the selected (star)."""
     lowest = front.errors.min()
-    if front.cloud is not None:
-        _draw_cloud(ax, front.cloud, label=_LAYERS[0])
-        lowest = min(lowest, front.cloud.errors.min(initial=np.inf))
+    if front.ensemble is not None:
+        _draw_ensemble(ax, front.ensemble, label=_LAYERS[0])
+        lowest = min(lowest, front.ensemble.errors.min(initial=np.inf))
     _draw_candidates(ax, front, np.clip(front.errors, FLOOR, TOP), chosen)
     rows = "held-out" if front.held_out else "training"
     ax.set(ylabel=f"error, $1 - R^2$ ({rows} rows)", yscale="log")
@@ -134,16 +134,16 @@ def _add_hovers(ax: Axes, front: ParetoFront, label: str) -> None:
         )
 
 
-def _draw_cloud(ax: Axes, cloud: Cloud, *, label: str) -> None:
+def _draw_ensemble(ax: Axes, ensemble: Ensemble, *, label: str) -> None:
     """Draw light dots; models far worse than none are carets at the upper edge."""
-    above = cloud.errors > TOP
+    above = ensemble.errors > TOP
     look: dict[str, Any] = {"color": GREY, "ls": "none", "zorder": 2, "alpha": 0.85, "mew": 0.0}
     ax.plot(
-        cloud.sizes[~above], np.maximum(cloud.errors[~above], FLOOR), marker="o", ms=3.5,
+        ensemble.sizes[~above], np.maximum(ensemble.errors[~above], FLOOR), marker="o", ms=3.5,
         label=label, **look,
     )  # fmt: skip
     if above.any():
-        sizes = np.unique(cloud.sizes[above])
+        sizes = np.unique(ensemble.sizes[above])
         at_edge = np.full(len(sizes), TOP)
         ax.plot(sizes, at_edge, marker=6, ms=5, clip_on=False, **look)  # 6: a caret up
 

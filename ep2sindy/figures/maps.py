@@ -43,10 +43,10 @@ PANEL_WIDTH = 1.9  # inches
 SOURCE, SINK = colormaps["Reds"](0.75), colormaps["Blues"](0.75)
 STATUS_COLOURS = ("#dceaf7", "#ffffff", COLOURS[3], COLOURS[4], COLOURS[1])
 # Neither has a shade near white, which marks a cell without a value.
-SHARE_COLOURS = colormaps["viridis"]
+FRACTION_COLOURS = colormaps["viridis"]
 COUNT_COLOURS = ListedColormap(colormaps["Purples"](np.linspace(0.35, 1.0, 256)))
 
-HALF = r"the same at $R^2 \times$ share of bootstraps = 0.5"
+HALF = r"the same at $R^2 \times$ fraction of bootstraps = 0.5"
 
 
 def coefficient_maps(result: xr.Dataset, *, outline: Thruster | None = None) -> Figure:
@@ -54,7 +54,7 @@ def coefficient_maps(result: xr.Dataset, *, outline: Thruster | None = None) -> 
 
     result: from `studies.pointwise`. Red is a positive coefficient (a source), blue a negative one;
     darker is larger in magnitude. Grey is a term that is not in the equation, white a point without
-    equations. Colours fade to grey as R2 of the equation, times the share of the bootstraps that
+    equations. Colours fade to grey as R2 of the equation, times the fraction of the bootstraps that
     have the term, falls to 0. Each column has one scale of whole decades. Terms that no point
     selected have no column. outline: the thruster whose channel is drawn. If the field has a single
     axis, magnitudes are drawn as points over it.
@@ -91,9 +91,9 @@ def coefficient_maps(result: xr.Dataset, *, outline: Thruster | None = None) -> 
 
 
 def _trust(result: xr.Dataset) -> xr.DataArray:
-    """Trust, 0 to 1, by equation, term and point: R2 times share of bootstraps with the term."""
-    share = result["inclusion"].fillna(1.0)  # unknown where there were no bootstraps
-    return result[r2_name(result)].clip(0.0, 1.0) * share
+    """Trust, 0 to 1, by equation, term and point: R2 times fraction of bootstraps with the term."""
+    fraction = result["inclusion"].fillna(1.0)  # unknown where there were no bootstraps
+    return result[r2_name(result)].clip(0.0, 1.0) * fraction
 
 
 def _fade(
@@ -179,7 +179,7 @@ def regime_map(regimes: Regimes, *, outline: Thruster | None = None) -> Figure:
     labels = regimes.labels.where(regimes.labels >= 0)
     panels = [
         Panel("regime", labels, ListedColormap(list(colours[:n])), _whole(n), bar=False),
-        Panel("confidence", regimes.confidence, SHARE_COLOURS),
+        Panel("confidence", regimes.confidence, FRACTION_COLOURS),
     ]
     figure = _draw_panels(panels, outline, width=3.7, extra=0.75 + 0.2 * n)
     patches = [Patch(color=colours[k], label=_regime_text(regimes, k)) for k in range(n)]
@@ -209,7 +209,7 @@ def quality_maps(result: xr.Dataset, *, outline: Thruster | None = None) -> Figu
     for equation in result["equation"].values:
         of, own = f"${latex_derivative(str(equation))}$", result.sel(equation=equation)
         panels += [
-            Panel(f"{of}: $R^2$, {rows}", own[name].clip(min=0.0), SHARE_COLOURS),
+            Panel(f"{of}: $R^2$, {rows}", own[name].clip(min=0.0), FRACTION_COLOURS),
             Panel(f"{of}: number of terms", own["n_terms"], COUNT_COLOURS, counts),
         ]
     status, patches = result["status"], []

@@ -31,7 +31,7 @@ from ep2sindy.operating.law import OperatingLaw
 from ep2sindy.operating.quantities import ControlLaw
 
 FAR_PERCENT, FAR_WAVEFORM = 40.0, 0.6  # beyond: filled marks on the edge
-MIN_RANGE = 0.1  # least axis range, as a share of the coefficient's size
+MIN_RANGE = 0.1  # least axis range, as a fraction of the coefficient's size
 MAX_LINES = 5  # number of the other parameters' values that are drawn
 FADED = 0.35  # opacity of a map's colours beyond the points that the law was fitted to
 WRONG = "#d00000"  # marks where the law says otherwise than the record; no colour of the map

@@ -30,7 +30,7 @@ from ep2sindy.signals.spectrum import dominant_frequency, power_spectrum
 
 SINCE_START = "time since start of integration"
 
-RARE = 0.01  # share of derivative samples, low or high, kept out of the scale as edge spikes
+RARE = 0.01  # fraction of derivative samples, low or high, kept out of the scale as edge spikes
 
 
 def data_figure(run: Trajectory, *, duration_s: float, f_max_Hz: float) -> Figure:
@@ -81,7 +81,7 @@ def derivative_figure(
 
     Spikes of the derivative do not set the scale; carets mark where a curve leaves the panel.
     """
-    clock, pieces = run.clock, run.stretches()
+    clock, pieces = run.clock, run.segments()
     slopes = np.concatenate([smoother.derivative(each.t, each.states) for each in pieces])
     times = np.concatenate([each.t for each in pieces])
     data = first_part(times, clock.seconds * slopes, duration_s, clock)

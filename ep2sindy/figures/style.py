@@ -112,7 +112,7 @@ def make_grid(
 ) -> tuple[Figure, Sequence[Axes]]:
     """A canvas of n panels of this size in inches, as many in a row as fit, none empty.
 
-    extra: additional height in inches. sharex, sharey: whether the panels share these axes.
+    extra: additional height in inches. sharex, sharey: whether the panels fraction these axes.
     x_label: written below the lowest panel of every column.
     """
     n_rows = -(-n // max(1, int(WIDTH / width)))
@@ -225,7 +225,7 @@ def frame_limits(
 ) -> Limits:
     """Limits around data and models, within twice the data's range.
 
-    A model that runs away must not shrink the rest. rare: share of the lowest and of the highest
+    A model that runs away must not shrink the rest. rare: fraction of the lowest and of the highest
     data that does not count for the range, such as spikes at a derivative's ends.
     """
     values = np.sort(data)
@@ -263,9 +263,9 @@ def find_exits(
     found = []
     for start, end in steps:
         edge, step = np.clip(end, *limits.T), end - start
-        shares = np.divide(edge - start, step, out=np.full(2, np.inf), where=edge != end)
-        axis = int(shares.argmin())
-        place = edge if start is middle else start + shares[axis] * step
+        fractions = np.divide(edge - start, step, out=np.full(2, np.inf), where=edge != end)
+        axis = int(fractions.argmin())
+        place = edge if start is middle else start + fractions[axis] * step
         place[axis] = edge[axis]
         found.append((float(place[0]), float(place[1]), CARETS[axis, int(step[axis] > 0.0)]))
     return found

@@ -1,7 +1,7 @@
 """Forecasts from the past of a record alone, without a model, which a model must beat.
 
-All of them work at equal steps: samples at other times are interpolated onto such, stretch by
-stretch between gaps, and what is forecast is interpolated back.
+All of them work at equal steps: samples at other times are interpolated onto such, segment by
+segment between gaps, and what is forecast is interpolated back.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def spread_starts(
 ) -> Int[np.ndarray, " starts"]:
     """At most n starts of forecasts of `longest` samples, evenly spread from a first one on.
 
-    A forecast and the sample before it lie in one stretch without a gap, unless none of them does.
+    A forecast and the sample before it lie in one segment without a gap, unless none of them does.
     """
     starts = np.arange(min(first, len(t) - longest), len(t) - longest + 1)
     end = np.array(between_gaps(t))[:, 1]
@@ -220,13 +220,13 @@ class Autoregression:
     @staticmethod
     def of(run: Trajectory) -> Autoregression | None:
         """None for too few samples."""
-        d, stretches = run.states.shape[1], _even_stretches(run, MAX_FITTED)
-        most = _largest_order(run, stretches)
+        d, segments = run.states.shape[1], _even_segments(run, MAX_FITTED)
+        most = _largest_order(run, segments)
         if most < 1:
             return None
-        (found, cost), least = _fit_autoregression(stretches, d, most), run.states.min(axis=0)
+        (found, cost), least = _fit_autoregression(segments, d, most), run.states.min(axis=0)
         if (least > 0.0).all():
-            logs = [np.hstack([np.log(each[:, :d]), each[:, d:]]) for each in stretches]
+            logs = [np.hstack([np.log(each[:, :d]), each[:, d:]]) for each in segments]
             in_logs, cost_in_logs = _fit_autoregression(logs, d, most)
             # A density of log x is one of x times x.
             if cost_in_logs + 2.0 * sum(float(each[most:, :d].sum()) for each in logs) < cost:
@@ -255,16 +255,16 @@ class Autoregression:
 
 
 def _fit_autoregression(
-    stretches: Sequence[np.ndarray], d: int, most: int
+    segments: Sequence[np.ndarray], d: int, most: int
 ) -> tuple[Autoregression, float]:
     """The autoregression of the order with least AIC, at steps of one, and this criterion.
 
-    stretches: (samples, states and inputs). d: number of states. All orders are compared on the
+    segments: (samples, states and inputs). d: number of states. All orders are compared on the
     same rows, by one triangular factor: its columns are ordered by lag.
     """
-    values = np.concatenate(stretches)
+    values = np.concatenate(segments)
     mean, scale = values.mean(axis=0), zero_to_one(values.std(axis=0))
-    scaled = [(each - mean) / scale for each in stretches]
+    scaled = [(each - mean) / scale for each in segments]
     rows, targets = _lagged(scaled, d, most)
     # Columns before the lags, and those of every lag.
     n, first, each = len(rows), 1 + values.shape[1] - d, values.shape[1]
@@ -287,10 +287,10 @@ def _fit_autoregression(
     return Autoregression(1.0, constant, coef, drive), min(costs) + density
 
 
-def _lagged(stretches: Sequence[np.ndarray], d: int, order: int) -> tuple[np.ndarray, np.ndarray]:
+def _lagged(segments: Sequence[np.ndarray], d: int, order: int) -> tuple[np.ndarray, np.ndarray]:
     """Rows [1, inputs now, then states and inputs by lag], and the states that follow."""
     rows, targets = [], []
-    for values in stretches:
+    for values in segments:
         n = len(values) - order
         if n > 0:
             lags = [values[order - lag : order - lag + n] for lag in range(1, order + 1)]
@@ -299,7 +299,7 @@ def _lagged(stretches: Sequence[np.ndarray], d: int, order: int) -> tuple[np.nda
     return np.concatenate(rows), np.concatenate(targets)
 
 
-def _largest_order(run: Trajectory, stretches: Sequence[np.ndarray]) -> int:
+def _largest_order(run: Trajectory, segments: Sequence[np.ndarray]) -> int:
     """Largest order that is tried: two periods, if there are samples enough."""
     frequency_Hz = max(dominant_frequency(run.t, column) for column in run.states.T)
     periods = frequency_Hz * float(run.t[-1] - run.t[0])
@@ -307,7 +307,7 @@ def _largest_order(run: Trajectory, stretches: Sequence[np.ndarray]) -> int:
     most = MAX_ORDER if d == 1 else MAX_ORDERS / d
     wanted = 2.0 * run.n_samples / periods if periods >= 1.0 else most
     each = run.values.shape[1]
-    lengths = np.array([len(stretch) for stretch in stretches])
+    lengths = np.array([len(segment) for segment in segments])
     allowed = [
         order
         for order in range(1, int(min(wanted, most)) + 1)
@@ -331,14 +331,14 @@ class Neighbours:
     A moment is described by samples of all states and inputs at equal delays; the number of these,
     the delay, and the number of neighbours have the least error over a period in the record itself,
     for moments whose own time is left out.
-    stretches: (samples, columns), scaled. n_states: the first columns. mean and scale: of these.
+    segments: (samples, columns), scaled. n_states: the first columns. mean and scale: of these.
     delay: in steps.
     Source: Lorenz 1969, doi:10.1175/1520-0469(1969)26<636:APARBN>2.0.CO;2; Sugihara & May 1990,
     doi:10.1038/344734a0.
     """
 
     step_s: float
-    stretches: Sequence[Float[np.ndarray, "_ columns"]]
+    segments: Sequence[Float[np.ndarray, "_ columns"]]
     n_states: int
     mean: Float[np.ndarray, " columns"]
     scale: Float[np.ndarray, " columns"]
@@ -349,10 +349,10 @@ class Neighbours:
     @staticmethod
     def of(run: Trajectory, longest: int) -> Neighbours | None:
         """None for too few samples. longest: horizon of later forecasts, in samples."""
-        stretches = _even_stretches(run, MAX_KNOWN)
-        values, d = np.concatenate(stretches), run.states.shape[1]
+        segments = _even_segments(run, MAX_KNOWN)
+        values, d = np.concatenate(segments), run.states.shape[1]
         mean, scale = values.mean(axis=0), zero_to_one(values.std(axis=0))
-        scaled = [(each - mean) / scale for each in stretches]
+        scaled = [(each - mean) / scale for each in segments]
         simplest = Neighbours(usual_step(run.t), scaled, d, mean, scale)
         per_period = period_of(run, run.state_names) / simplest.step_s
         apart = int(min(longest, per_period)) if np.isfinite(per_period) else longest
@@ -385,11 +385,11 @@ class Neighbours:
     def _moments(self, longest: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Descriptions of the moments that `longest` samples follow, their places, and samples."""
         back = self.delay * np.arange(self.n_delays)[::-1]
-        begins = np.cumsum([0, *map(len, self.stretches)])
+        begins = np.cumsum([0, *map(len, self.segments)])
         place = np.concatenate(
             [np.arange(begin + back[0], end - longest) for begin, end in pairwise(begins)]
         )
-        values = np.concatenate(self.stretches)
+        values = np.concatenate(self.segments)
         size = len(back) * values.shape[1]
         return values[place[:, None] - back].reshape(len(place), size), place, values
 
@@ -416,7 +416,7 @@ class Neighbours:
 # Samples at equal steps.
 
 
-def _even_stretches(run: Trajectory, most: int) -> list[Float[np.ndarray, "_ columns"]]:
+def _even_segments(run: Trajectory, most: int) -> list[Float[np.ndarray, "_ columns"]]:
     """States and inputs between gaps, at the usual step; the last `most` samples."""
     step_s, found = usual_step(run.t), []
     for start, stop in reversed(between_gaps(run.t)):

@@ -25,21 +25,21 @@ from ep2sindy.model.rollout import Rollout
 from ep2sindy.model.stability import (
     LEAST_WAIT,
     LimitCycle,
+    basin_stability,
     limit_cycle,
     periods_to_reach,
-    share_reaching,
 )
 from ep2sindy.runtime.screen import WIDTH, html_table, one_screen, text_table
 from ep2sindy.runtime.values import check_kind
 from ep2sindy.signals.attractor import follow_phase
-from ep2sindy.signals.spectrum import DIED_OUT, dominant_frequency
+from ep2sindy.signals.spectrum import DECAYED, dominant_frequency
 
 N_REST = 16  # samples of a record from which rest points are looked for
-NEUTRAL = 1e-6  # growth per turn of a departure from a rest point that neither grows nor decays
+NEUTRAL = 1e-6  # growth per turn of a perturbation from a rest point that neither grows nor decays
 # Distance of two rest points, in standard deviations: Newton's method ends short of multiple roots.
 APART = 1e-2
 STD, WIDEST = " standard deviations", len("amplitude ratio  ")
-LEFT = 100.0  # times a record's size, from which a run's is not told
+LEFT = 100.0  # times a record's size, from which a run's is not reported
 N_SHOWN = 4  # most states, and most rest points, that the table shows one by one
 
 
@@ -50,7 +50,7 @@ class HoldsModel(Protocol):
     @property
     def model(self) -> SparseModel: ...
     @property
-    def misfit(self) -> str: ...
+    def lack_of_fit(self) -> str: ...
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -104,10 +104,10 @@ class Evaluation:
 
     @cached_property
     def frequency_Hz(self) -> Mapping[str, float]:
-        """By state; NaN if the run diverged or the state died out."""
+        """By state; NaN if the run diverged or the state decayed."""
         found = {}
         for k, column in enumerate(self.rollout.states.T):
-            alive = column[len(column) // 2 :].std() > DIED_OUT * self.compared.std[k]
+            alive = column[len(column) // 2 :].std() > DECAYED * self.compared.std[k]
             steady = alive and not self.rollout.diverged
             frequency_Hz = dominant_frequency(self.rollout.t, column) if steady else float("nan")
             found[self.model.states[k]] = frequency_Hz
@@ -180,9 +180,9 @@ class Evaluation:
         return float("nan") if self.cycle is None else self.cycle.largest_multiplier
 
     @cached_property
-    def share_reaching(self) -> float:
-        """Share of the starts around the cycle that reach it; NaN without a cycle."""
-        return float("nan") if self.cycle is None else share_reaching(self.model, self.cycle)
+    def basin_stability(self) -> float:
+        """Fraction of the starts around the cycle that reach it; NaN without a cycle."""
+        return float("nan") if self.cycle is None else basin_stability(self.model, self.cycle)
 
     @cached_property
     def rest(self) -> RestPoint | None:
@@ -247,8 +247,8 @@ class Evaluation:
         wait = periods_to_reach(self.cycle)
         slowly = f", slowly, over {wait:.0f} periods" if wait > LEAST_WAIT else ""
         text = (
-            f"The cycle is {self.cycle.stability}: of a departure {self.multiplier:.3g} is left "
-            f"after a period (Floquet multiplier); {100.0 * self.share_reaching:.0f} % of starts "
+            f"The cycle is {self.cycle.stability}: of a perturbation {self.multiplier:.3g} is left "
+            f"after a period (Floquet multiplier); {100.0 * self.basin_stability:.0f} % of starts "
             f"from 0.3 to 3 times the cycle's mean reach it{slowly}."
         )
         return text if self.rest is None else f"{text} It rests at {self._rest_text(self.rest)}."
@@ -259,7 +259,7 @@ class Evaluation:
         return [f"rests at {self._rest_text(rest)}" for rest in self.rest_points[:N_SHOWN]]
 
     def _rest_text(self, rest: RestPoint) -> str:
-        """Where the model rests, and what becomes of a small departure."""
+        """Where the model rests, and what becomes of a small perturbation."""
         units, clock = self.model.units, self.rollout.clock
         place = ", ".join(
             f"{state} = {value:.3g}{'' if units[state] == '1' else f' {units[state]}'}"
@@ -272,7 +272,7 @@ class Evaluation:
         turns = (
             f" and turns at {clock.frequency_text(rest.frequency_Hz)}" if rest.frequency_Hz else ""
         )
-        return f"{place}, {kind}: a departure {change}{rate}{turns}"
+        return f"{place}, {kind}: a perturbation {change}{rate}{turns}"
 
     @property
     def rows(self) -> list[tuple[str, str]]:
@@ -282,7 +282,7 @@ class Evaluation:
         error = f" ({100.0 * self.f_error:+.2g} %)" if np.isfinite(self.f_error) else ""
         cycle = self.cycle and (
             f"{self.cycle.stability}, multiplier {self.multiplier:.3g}; "
-            f"{100.0 * self.share_reaching:.0f} % of starts reach it"
+            f"{100.0 * self.basin_stability:.0f} % of starts reach it"
         )
         phase = f"in phase for {self.periods:.3g} periods; {self.phase_end:+.2g} periods at the end"
         found = [
@@ -317,22 +317,22 @@ def evaluate(
     initial: Float[np.ndarray, " n_states"] | None = None,
     n_samples: int | None = None,
     bounds: FreeRunBounds | None = None,
-    judged: Sequence[str] | None = None,
+    assessed: Sequence[str] | None = None,
     n_fitted: int | None = None,
 ) -> Evaluation:
     """Run a model over a record, or its first samples, and compare the attractors.
 
-    model: a SparseModel, or a Discovery, whose misfit is then told. run: a Trajectory, or what
-    `discover` takes as one run. initial: the state to start from, in SI; None takes the data's.
-    n_samples: of the run that are compared; None takes all. judged: states that determine the
-    status and f_error, such as the measured one; None takes all. n_fitted: samples at the start
+    model: a SparseModel, or a Discovery, whose lack of fit is then reported. run: a Trajectory, or
+    what `discover` takes as one run. initial: the state to start from, in SI; None takes the
+    data's. n_samples: of the run that are compared; None takes all. assessed: states that determine
+    the status and f_error, such as the measured one; None takes all. n_fitted: samples at the start
     that the model was fitted to; it is then run over the rest, from the last of these, and
-    forecasts of the rest are counted.
-    Raises ValueError for a judged state that the model does not have, or too few samples.
+    forecasts of the rest are counted. Raises ValueError for a assessed state that the model does
+    not have, or too few samples.
     """
-    misfit, forecasts = "", None
+    lack_of_fit, forecasts = "", None
     if isinstance(model, HoldsModel):
-        misfit, model = model.misfit, model.model
+        lack_of_fit, model = model.lack_of_fit, model.model
     check_kind("model", model, SparseModel, "found.model")
     whole = part = trajectory_of(run)
     if n_fitted is not None:
@@ -343,13 +343,13 @@ def evaluate(
     rollout = model.rollout(part, n_samples=n_samples, initial=initial)
     part, bounds = part.window(0, n_samples), bounds or FreeRunBounds()
     compared = record_of(part, model.states)
-    likeness = ours = compared.likeness(rollout.states, bounds)
-    if judged is not None:
-        columns = columns_of(model.states, judged)
-        ours = record_of(part, judged).likeness(rollout.states[:, columns], bounds)
+    similarity = ours = compared.similarity(rollout.states, bounds)
+    if assessed is not None:
+        columns = columns_of(model.states, assessed)
+        ours = record_of(part, assessed).similarity(rollout.states[:, columns], bounds)
     by_state = {
         name: MappingProxyType(dict(zip(model.states, values.tolist(), strict=True)))
-        for name, values in likeness.by_state.items()
+        for name, values in similarity.by_state.items()
     }
     return Evaluation(
         model=model,
@@ -359,7 +359,7 @@ def evaluate(
         status=Status.LEAVES_DOMAIN if rollout.outside else ours.status,
         is_similar=ours.is_similar,
         f_error=ours.f_error,
-        lack_of_fit=misfit,
+        lack_of_fit=lack_of_fit,
         forecasts=forecasts,
         **by_state,
     )

@@ -40,7 +40,7 @@ from ep2sindy.runtime.threads import one_thread
 from ep2sindy.runtime.values import check_count, read_only
 from ep2sindy.signals.spectrum import is_uniform
 
-LEVEL = 0.9  # share of the samples that a band is to hold
+LEVEL = 0.9  # fraction of the samples that a band is to hold
 UPPER = 0.5 + 0.5 * LEVEL  # level of its upper bound
 
 # Makes all states of a past, whose first columns are the measured ones.
@@ -48,12 +48,13 @@ StatesOf = Callable[[Trajectory], Trajectory]
 
 # Starts of the forecasts whose bands are calibrated, draws of each, and how far they go.
 N_STARTS, N_DRAWS, N_WEIGHED, PERIODS_AHEAD = 40, 100, 30, 4.0
-# Slow variations from start to start that tell the error of a share, and the least such error; with
-# under twice as many starts, a band is not told.
+# Slow variations from start to start that tell the error of a fraction, and the least such error;
+# with under twice as many starts, a band is not reported.
 N_WAVES, SURELY = 4, 1e-3
 LEAST_STARTS = 2 * N_WAVES
 # Of the likeliest process noise, what is taken: it explains single steps, and what a model misses
-# there may be no push. Under too large pushes, the median of the draws leaves the model's own path.
+# there may be no process noise. Under too large process noise, the median of the draws leaves the
+# model's own path.
 FACTORS = (0.1, 0.3, 1.0)
 
 
@@ -85,10 +86,10 @@ class Forecast:
     def band(
         self, level: float = LEVEL
     ) -> tuple[Float[np.ndarray, "samples n_states"], Float[np.ndarray, "samples n_states"]]:
-        """Lower and upper bound that hold this share of the samples, the sensor's noise included.
+        """Bounds that hold this fraction of the samples, the sensor's noise included.
 
         Draws that diverged count neither way; NaN where no band is shown. Raises ValueError for a
-        level that is no share.
+        level that is no fraction.
         """
         rng = np.random.default_rng(self.seed)
         noise = np.nan_to_num(self.noise_std) * rng.standard_normal(self.draws.shape)
@@ -97,7 +98,7 @@ class Forecast:
 
     @property
     def diverged(self) -> float:
-        """Share of the draws that diverged."""
+        """Fraction of the draws that diverged."""
         return float(np.isnan(self.draws[:, -1]).any(axis=1).mean())
 
 
@@ -169,7 +170,7 @@ def forecast(
     one, from this process noise, and from the noise; they are as many times wider as the errors of
     forecasts within that record say (`calibrate`).
     history: samples of the measured states and of the inputs; a Trajectory, a table or (t, x).
-    States of the model that it lacks are told from the others (`estimate_states`).
+    States of the model that it lacks are distinguished from the others (`estimate_states`).
     horizon: duration in s, in steps of the history; or the times (samples,) themselves, in s.
     fitted_to: the record that the model was fitted to; None takes the history. measured: states
     that were measured; others that the history has were made from them (`ep.embed`), and
@@ -268,7 +269,7 @@ class RollingStarts:
         return np.stack([each.states[:, self.estimator.measured] for each in ahead])
 
     def coverage(self, ahead: Sequence[Forecast], level: float) -> float:
-        """Share of the samples that bands hold, where there are any; NaN if there are none."""
+        """Fraction of the samples that bands hold, where there are any; NaN if there are none."""
         off = self.off(ahead, level)
         return float((off <= 1.0).sum() / np.isfinite(off).sum()) if np.isfinite(off).any() else nan
 
@@ -299,11 +300,11 @@ def calibrate(
 
     Forecasts from its later two thirds, each from its own past, go up to four periods ahead, or
     a quarter of these. The process noise under which they err least in the median is taken. Widths,
-    of bands that hold 90 %, are told at horizons of 1, 2 to 3, 4 to 7 samples and so on. None are
-    told of a record that is too short, where forecasts diverge, or of one that grows or decays
-    throughout, whose past errors do not tell later ones. run: that record. states_of: as for
-    `forecast_skill`.
-    Source: Vovk, Gammerman & Shafer 2005, doi:10.1007/b106715, for bands by ranks of past errors.
+    of bands that hold 90 %, are reported at horizons of 1, 2 to 3, 4 to 7 samples and so on. None
+    are reported of a record that is too short, where forecasts diverge, or of one that grows or
+    decays throughout, whose past errors do not tell later ones. run: that record. states_of: as for
+    `forecast_skill`. Source: Vovk, Gammerman & Shafer 2005, doi:10.1007/b106715, for bands by ranks
+    of past errors.
     """
     begin = max(MIN_SAMPLES, run.n_samples // 3)
     longest = min(int(PERIODS_AHEAD * estimator.per_period), (run.n_samples - begin) // 4)
@@ -311,7 +312,10 @@ def calibrate(
     if run.n_samples - begin - longest < LEAST_STARTS:
         return replace(estimator, widths=unknown)
     first = spread_starts(run.t, begin, longest, N_STARTS)
-    tried = [RollingStarts(estimator.pushed(factor), run, first, longest) for factor in FACTORS]
+    tried = [
+        RollingStarts(estimator.with_process_noise(factor), run, first, longest)
+        for factor in FACTORS
+    ]
     scale = zero_to_one(run.columns(estimator.names).std(axis=0))
     with progress.stage(None, "", "width of the forecasts' bands"):
         pasts = tried[0].pasts(states_of)
@@ -331,16 +335,17 @@ def calibrate(
         [_width(column) for column in np.moveaxis(off[:, start:stop], 2, 0)]
         for start, stop in pairwise(edges)
     ]
-    told = BandWidths(tried[best].steps_s[edges[1:] - 1], widths)
-    return replace(tried[best].estimator, widths=told)
+    stated = BandWidths(tried[best].steps_s[edges[1:] - 1], widths)
+    return replace(tried[best].estimator, widths=stated)
 
 
 def _width(off: Float[np.ndarray, "starts ahead"]) -> float:
     """Width of a band that holds as many samples as it should, in the one of which these are off.
 
-    It is the quantile of the distances. Their shares within it, start by start, tell its standard
-    error, and so how many independent distances there were. A quantile of these is uncertain
-    itself: it is larger by the ratio of Student's quantile, of as many degrees, to the normal one.
+    It is the quantile of the distances. Their fractions within it, start by start, tell its
+    standard error, and so how many independent distances there were. A quantile of these is
+    uncertain itself: it is larger by the ratio of Student's quantile, of as many degrees, to the
+    normal one.
     """
     off = np.nan_to_num(off, nan=np.inf)
     quantile = float(np.quantile(off, LEVEL, method="higher"))

@@ -47,7 +47,7 @@ from ep2sindy.runtime.values import check_count
 from ep2sindy.signals.spectrum import is_uniform
 
 PERIODS_AHEAD = 4.0  # longest horizon
-NEARER = 0.9  # share of the model's error below which a baseline is clearly nearer
+NEARER = 0.9  # fraction of the model's error below which a baseline is clearly nearer
 CLOSE = 0.5  # error, in standard deviations, halfway to the mean, whose error is one
 MODEL = "model"
 WORDS = {
@@ -79,10 +79,10 @@ class ForecastSkill:
     NaN for a record without an oscillation. step_s, apart_s: between samples, and between starts.
     squared: by `model` and by the baselines `persistence`, `harmonics`, `autoregression` and
     `neighbours`, (starts, horizons): mean square errors over measured states, in variances of the
-    held-out samples. A baseline that the record does not allow is left out. coverage_90: share of
-    the held-out samples that the bands of 90 % hold; NaN without bands.
-    example: the forecast from the first start. order: of the autoregression. resampled: whether
-    baselines took samples at other times.
+    held-out samples. A baseline that the record does not allow is left out. coverage_90: fraction
+    of the held-out samples that the bands of 90 % hold; NaN without bands. example: the forecast
+    from the first start. order: of the autoregression. resampled: whether baselines took samples at
+    other times.
     """
 
     horizons_s: Float[np.ndarray, " horizons"]
@@ -190,8 +190,8 @@ class ForecastSkill:
     def headline(self) -> str:
         """What was found, by what it foresees: `a model that forecasts better than ...`.
 
-        A model that is no better, but close for a period or more, is told with how long it is: a
-        record without noise that repeats itself is foreseen by anything linear as well.
+        A model that is no better, but close for a period or more, is reported with how long it is:
+        a record without noise that repeats itself is foreseen by anything linear as well.
         """
         if self.is_better:
             return f"a model that forecasts {self.text}"

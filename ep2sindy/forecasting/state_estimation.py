@@ -143,17 +143,17 @@ class StateEstimator:
     def smooth(self, run: Trajectory) -> Trajectory:
         """All states of the model along a run, fitted to the measured ones under the errors.
 
-        Between gaps it starts anew. Stretches of under five samples are left out.
+        Between gaps it starts anew. Segments of under five samples are left out.
         """
         own = _select_variables(self.model, run)
         whole = self.problem.record(own)
-        pieces = whole.stretches()
+        pieces = whole.segments()
         paths = [self.fit_path(piece, piece.samples).path for piece in pieces]
         kept = np.isin(whole.times, np.concatenate([piece.times for piece in pieces]))
         states = np.concatenate(paths) * self.problem.scale
         return replace(own, t=own.t[kept], states=states, inputs=own.inputs[kept])
 
-    def pushed(self, factor: float) -> StateEstimator:
+    def with_process_noise(self, factor: float) -> StateEstimator:
         """The same with process noise that is larger by a factor."""
         noise = replace(self.noise, process=factor * self.noise.process)
         return replace(self, noise=noise)
@@ -173,8 +173,8 @@ class StateEstimator:
         samples, process = self.scaled_noise()
         fit = _fix(self.problem, [record], [path], self.free, samples)
         fit = replace(fit, n_substeps=self.n_substeps)
-        for share in (*CONTINUATION, 0.0):
-            fit = fit_paths(replace(fit, process_noise=np.maximum(process, share * samples)))
+        for fraction in (*CONTINUATION, 0.0):
+            fit = fit_paths(replace(fit, process_noise=np.maximum(process, fraction * samples)))
         return fit
 
 
@@ -197,9 +197,7 @@ def tune_estimator(
     """
     names = measured_states(model, run) if measured is None else list(measured)
     if not names or not set(names) <= set(model.states):
-        raise ValueError(
-            f"measured must name some of the states {list(model.states)}, got {names}"
-        )
+        raise ValueError(f"measured must name some of the states {list(model.states)}, got {names}")
     if run.n_samples < MIN_SAMPLES:
         raise ValueError(
             f"a record must have {MIN_SAMPLES} samples or more to tell its noise: got "
@@ -254,7 +252,7 @@ def estimate_states(
 def _with_likely_noise(
     estimator: StateEstimator, paths: Sequence[np.ndarray]
 ) -> tuple[StateEstimator, list[np.ndarray]]:
-    """The estimator with the most likely noise about the states, and these states, by stretch."""
+    """The estimator with the most likely noise about the states, and these states, by segment."""
     records = estimator.problem.records
     paths = [estimator.fit_path(*pair).path for pair in zip(records, paths, strict=True)]
     samples, process = estimator.scaled_noise()

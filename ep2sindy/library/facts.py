@@ -49,12 +49,13 @@ class Facts:
         check_kind("roles", self.roles, Roles, "ep.Roles(exchange=[('n_n', 'n_i')])")
         if self.relations or self.only or self.excluded or self.known:
             raise ValueError(
-                "roles say which terms the equations may have and how they are tied, got relations, "
+                "roles say which terms the equations may have and how they are tied, got "
+                "relations, "
                 "terms, or coefficients as well; give roles alone, or leave them out"
             )
 
     def __or__(self, more: Facts) -> Facts:
-        """These facts and more of them; of an equation told twice, the last terms hold."""
+        """These facts and more of them; of an equation stated twice, the last terms hold."""
         barred = {**self.excluded, **more.excluded}
         return Facts(
             (*self.relations, *more.relations),
@@ -73,7 +74,7 @@ class Facts:
 
     @property
     def places(self) -> list[Place]:
-        """Every (state, term) that an equation is said to have."""
+        """Every (state, term) that an equation is stated to have."""
         named = [(state, term) for r in self.relations for _, state, term in r.factors]
         named += [(state, term) for state, terms in self.only.items() for term in terms]
         return [*named, *self.known_factors]
@@ -84,7 +85,8 @@ class Facts:
         for state, places in barred.items():
             if len(places) == len(library.names):
                 raise ValueError(
-                    f"exclude must leave terms to every equation, got all {len(places)} of the library"
+                    f"exclude must leave terms to every equation, got all {len(places)} of the "
+                    "library"
                     f" for {state!r}; leave some of them out of exclude"
                 )
         for state, term in self.places:

@@ -249,8 +249,8 @@ def register_function(
         raise ValueError(f"a domain must be an interval (low, high), got {domain}")
     if derivative is None:
         needs = f"a derivative is found by itself for {FORMULA}: {name!r} is none"
-        way_out = f"give it, as in ep.register_function({name!r}, value, derivative)"
-        _record(value, (low, high), needs, way_out)
+        hint = f"give it, as in ep.register_function({name!r}, value, derivative)"
+        _record(value, (low, high), needs, hint)
         derivative = partial(_evaluate_slope, value, (low, high))
     _check_derivative(name, value, derivative, low, high)
     _kinds[name] = Kind(name, value, derivative, ((low, high),), own=True)
@@ -303,11 +303,11 @@ def points_inside(low: float, high: float) -> Float[np.ndarray, " points"]:
 
 
 def _record(
-    value: Values, domain: Interval, needs: str = "", way_out: str = ""
+    value: Values, domain: Interval, needs: str = "", hint: str = ""
 ) -> tuple[sympy.Symbol, sympy.Expr]:
     """A symbol, and what a function computes of it, checked at a few points of its domain.
 
-    needs, way_out: of the ValueError that is raised, with the reason, if it is no formula.
+    needs, hint: of the ValueError that is raised, with the reason, if it is no formula.
     """
     import sympy  # imported here because it takes half a second and most runs do not need it
 
@@ -319,7 +319,7 @@ def _record(
         if not np.allclose(numbers, value(points), rtol=1e-9, atol=0.0):
             raise ValueError(f"as a formula it has other values, {numbers}")
     except (TypeError, ValueError, AttributeError, ArithmeticError, IndexError) as error:
-        raise ValueError(f"{needs} ({error!s:.150}); {way_out}") from error
+        raise ValueError(f"{needs} ({error!s:.150}); {hint}") from error
     return x, found
 
 

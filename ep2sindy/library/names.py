@@ -49,7 +49,8 @@ def check_variable(name: str) -> None:
         word = re.sub(r"\W+", "_", str(name)).strip("_")[:50] or "x"
         other = f"x{word}" if word[0].isdecimal() else word
         raise ValueError(
-            f"a variable's name must be a word of letters, digits and _, such as 'n_i', got {name!r}"
+            "a variable's name must be a word of letters, digits and _, such as 'n_i', got "
+            f"{name!r}"
             f"; rename it, perhaps {other!r}"
         )
 
@@ -122,7 +123,8 @@ def split_term(name: str) -> list[Part]:
         return []
     if not _TERM.fullmatch(name):
         raise ValueError(
-            f"a term is variables joined by *, with whole powers, and functions of one variable, got "
+            "a term is variables joined by *, with whole powers, and functions of one variable, "
+            "got "
             f"{name!r:.300}; write it like 'n_i^2*n_n', 'x*sin(2*y)' or 'x/(0.5+y)'"
         )
     parts = []

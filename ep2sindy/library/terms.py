@@ -183,6 +183,6 @@ def check_values(n_terms: int, shape: Sequence[int]) -> None:
     check_memory(
         24.0 * n_terms * n_samples,  # 8 bytes per value, and temporary arrays
         f"{n_terms} terms at {n_samples} samples",
-        way_out="take every second sample (ep2sindy.data.decimate), or fewer terms",
+        hint="take every second sample (ep2sindy.data.decimate), or fewer terms",
         each=24.0 * n_terms,
     )

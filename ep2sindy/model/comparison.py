@@ -17,7 +17,7 @@ from ep2sindy.signals.attractor import (
     waveform_errors,
     white_variance,
 )
-from ep2sindy.signals.spectrum import DIED_OUT, dominant_frequency, has_decayed, power_spectrum
+from ep2sindy.signals.spectrum import DECAYED, dominant_frequency, has_decayed, power_spectrum
 
 LONG = 8.0  # fewest periods in a record whose first half may be left out as a transient
 
@@ -29,9 +29,9 @@ BELOW_ZERO = 1e-3
 # or decays.
 SPIRALS = 1.5
 
-# Error over the first period, in standard deviations, above which a run does not live that began on
-# the data; noise in the samples, in the same unit, above which it is not asked for, since the start
-# is as uncertain.
+# Error over the first period, in standard deviations, above which a run does not sustain its
+# oscillation that began on the data; noise in the samples, in the same unit, above which it is not
+# asked for, since the start is as uncertain.
 FIRST_PERIOD, TOO_NOISY = 0.3, 0.1
 
 
@@ -135,7 +135,7 @@ class ComparedRecord:
     def excursion(self, states: Float[np.ndarray, "_ n_states"]) -> float:
         return float((np.abs(states - self.states.mean(axis=0)) / self.std).max())
 
-    def likeness(
+    def similarity(
         self, states: Float[np.ndarray, "_ n_states"], bounds: FreeRunBounds
     ) -> Comparison:
         """Compare a run at the times t with this record; a run with fewer samples has diverged."""
@@ -149,7 +149,7 @@ class ComparedRecord:
         if turns_negative(late, self.densities, self.std):
             return Comparison(Status.NEGATIVE, False, np.nan, by_state)
         middle = len(states) // 2
-        if has_decayed(states[middle:], self.states[middle:], DIED_OUT).all():
+        if has_decayed(states[middle:], self.states[middle:], DECAYED).all():
             return Comparison(Status.DECAYS, False, np.nan, by_state)
         if spirals(self.states):
             is_similar = self._is_followed(states, bounds)
@@ -250,11 +250,11 @@ def turns_negative(
     return bool((path[:, columns] < -BELOW_ZERO * std[columns]).any())
 
 
-def columns_of(states: Sequence[str], judged: Sequence[str] | None) -> list[int]:
-    """Column indices of the judged states, None meaning all; ValueError for an unknown state."""
-    names = list(states if judged is None else judged)
+def columns_of(states: Sequence[str], assessed: Sequence[str] | None) -> list[int]:
+    """Column indices of the assessed states, None meaning all; ValueError for an unknown state."""
+    names = list(states if assessed is None else assessed)
     if not names or not set(names) <= set(states):
-        raise ValueError(f"judged must name some of the states {list(states)}, got {names}")
+        raise ValueError(f"assessed must name some of the states {list(states)}, got {names}")
     return [list(states).index(name) for name in names]
 
 

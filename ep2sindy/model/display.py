@@ -29,15 +29,15 @@ def model_lines(
         states, tail = model.states[: room - 1], [f"... {left} more equations", foot]
     else:
         states, tail = model.states, [foot]
-    # Every equation gets one line, and an even share of the lines that are left over.
+    # Every equation gets one line, and an even fraction of the lines that are left over.
     spare = n_lines - len(tail) - len(states)
     lines: list[str] = []
     for k, state in enumerate(states):
         terms, reach = _per_time_unit(model, state, held)
         parts = equation_parts(terms, reach=reach) or ["0"]
         parts[-1] += f" [{_rate_unit(model, state)}]"
-        share = 1 + spare // (len(states) - k)
-        own = wrap([f"{state}' =", *parts], what="terms", n_lines=share)
+        fraction = 1 + spare // (len(states) - k)
+        own = wrap([f"{state}' =", *parts], what="terms", n_lines=fraction)
         spare -= len(own) - 1
         lines += own
     return [*lines, *tail]

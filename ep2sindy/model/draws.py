@@ -11,7 +11,7 @@ from ep2sindy.model.many import WindowSteps, run_many
 from ep2sindy.model.vector_field import Equations, VectorField
 
 # Substeps between two samples: the fewest whose central run differs from that of twice as many by
-# no more than this share of its largest states.
+# no more than this fraction of its largest states.
 MAX_SUBSTEPS, ACCURATE = 64, 1e-4
 
 # A run that goes farther than this many times the largest states of start and record has diverged.
@@ -119,13 +119,13 @@ def _fine_enough(
 
 
 def starts_around(states: np.ndarray, n_starts: int, spread: tuple[float, float]) -> np.ndarray:
-    """Starts (starts, n_states) that fill a box; see `share_reaching`."""
+    """Starts (starts, n_states) that fill a box; see `basin_stability`."""
     from scipy.stats.qmc import Halton  # its import takes a quarter of a second
 
-    share = Halton(states.shape[1], scramble=False).random(n_starts + 1)[1:]  # the first is zero
+    fraction = Halton(states.shape[1], scramble=False).random(n_starts + 1)[1:]  # the first is zero
     mean = states.mean(axis=0)
     reach = spread[1] * 0.5 * np.ptp(states, axis=0)
     low, high = np.log(spread)
     one_sign = (states > 0.0).all(axis=0) | (states < 0.0).all(axis=0)
-    around = mean * np.exp(low + (high - low) * share)
-    return np.where(one_sign, around, mean + reach * (2.0 * share - 1.0))
+    around = mean * np.exp(low + (high - low) * fraction)
+    return np.where(one_sign, around, mean + reach * (2.0 * fraction - 1.0))

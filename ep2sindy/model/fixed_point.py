@@ -1,4 +1,4 @@
-"""Where an autonomous model rests, and what becomes of a small departure from there."""
+"""Where an autonomous model rests, and what becomes of a small perturbation from there."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class RestPoint:
     """A fixed point of an autonomous model, in SI.
 
     growth_per_s: largest real part of the eigenvalues of the Jacobian there, in 1/s; positive if
-    departures grow. frequency_Hz: with which that departure turns; zero if it does not.
+    perturbations grow. frequency_Hz: with which that perturbation turns; zero if it does not.
     """
 
     state: Float[np.ndarray, " n_states"]

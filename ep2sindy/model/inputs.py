@@ -44,7 +44,7 @@ def inputs_at_samples(
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """Inputs between samples: in each step a polynomial of the share of it that has passed.
+    """Inputs between samples: in each step a polynomial of the fraction of it that has passed.
 
     t: (samples,). pieces: (powers, steps, n_inputs), the highest power first. stops: times at
     which an input jumps or bends, where a scheme of high order must start anew. functions: of time
@@ -59,16 +59,16 @@ class Curve:
     def __call__(self, now: float) -> Float[np.ndarray, " n_inputs"]:
         """The inputs at one time; at a sample they have jumped already."""
         place = min(max(int(self.t.searchsorted(now, "right")) - 1, 0), len(self.t) - 2)
-        share = (now - self.t[place]) / (self.t[place + 1] - self.t[place])
-        values = np.polyval(self.pieces[:, place], share)
+        fraction = (now - self.t[place]) / (self.t[place + 1] - self.t[place])
+        values = np.polyval(self.pieces[:, place], fraction)
         for column, function in self.functions.items():
             values[column] = function(now)
         return values
 
-    def at(self, share: float) -> Float[np.ndarray, "steps n_inputs"]:
-        """The inputs at a given share of every step; at its end they have not jumped yet."""
-        values: np.ndarray = np.polyval(self.pieces, share)
-        times = self.t[:-1] + share * np.diff(self.t)
+    def at(self, fraction: float) -> Float[np.ndarray, "steps n_inputs"]:
+        """The inputs at a given fraction of every step; at its end they have not jumped yet."""
+        values: np.ndarray = np.polyval(self.pieces, fraction)
+        times = self.t[:-1] + fraction * np.diff(self.t)
         for column, function in self.functions.items():
             values[:, column] = [function(now) for now in times.tolist()]
         return values

@@ -50,11 +50,11 @@ def _rates(equations, t, y, columns, slope):
                 place = middle
             else:
                 above = middle
-        share = (t - breaks[place]) / (breaks[place + 1] - breaks[place])
+        fraction = (t - breaks[place]) / (breaks[place + 1] - breaks[place])
         for j in range(n_inputs):
             value = 0.0
             for power in range(len(pieces)):
-                value = value * share + pieces[power, place, j]
+                value = value * fraction + pieces[power, place, j]
             columns[n + j] = value
     _sum(table, product, target, weight, columns, slope)
 
@@ -106,12 +106,12 @@ def _polynomial(equations, scheme, t, h, start, end, slopes, at, columns, shape)
 
 
 @compiled(error_model="numpy")
-def _between(shape, start, share, out):
+def _between(shape, start, fraction, out):
     """Write the state at a given fraction of a step into `out`."""
     for i in range(len(start)):
         value = 0.0
         for k in range(7):
-            value = (value + shape[6 - k, i]) * (share if k % 2 == 0 else 1.0 - share)
+            value = (value + shape[6 - k, i]) * (fraction if k % 2 == 0 else 1.0 - fraction)
         out[i] = start[i] + value
 
 

@@ -40,8 +40,10 @@ class WindowSteps:
         h = np.repeat((t[places + 1] - t[places]) / n_substeps, n_substeps, axis=1)
         if curve is None:
             return WindowSteps(h, np.empty((*h.shape, 0, 3)), n_substeps)
-        shares = (np.arange(n_substeps)[:, None] + [0.0, 0.5, 1.0]) / n_substeps
-        nodes = np.array([[curve.at(share)[places] for share in row] for row in shares.tolist()])
+        fractions = (np.arange(n_substeps)[:, None] + [0.0, 0.5, 1.0]) / n_substeps
+        nodes = np.array(
+            [[curve.at(fraction)[places] for fraction in row] for row in fractions.tolist()]
+        )
         inputs = nodes.transpose(2, 3, 0, 4, 1)  # windows, samples, substeps, inputs, nodes
         return WindowSteps(h, np.ascontiguousarray(inputs.reshape(*h.shape, -1, 3)), n_substeps)
 

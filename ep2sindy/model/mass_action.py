@@ -10,13 +10,13 @@ from ep2sindy.model.model import SparseModel
 
 NONNEGATIVE = "no state can turn negative: every term that lowers one contains it"
 BOUNDED = "every run stays bounded: what states exchange is conserved, and all of them leave"
-CERTAIN = 1e-6  # least share of a term that must be left over for a proof, far above rounding
+CERTAIN = 1e-6  # least fraction of a term that must be left over for a proof, far above rounding
 
 
 def consequences(model: SparseModel) -> list[str]:
     """What holds for every run that starts from nonnegative states, by the terms alone.
 
-    None of it is said of a model with inputs, or with other functions than products of states.
+    None of it holds for a model with inputs, or with other functions than products of states.
     """
     factors = [factors_of(name) if name != "1" else {} for name in model.library.names]
     used = np.flatnonzero(model.coef.any(axis=1))

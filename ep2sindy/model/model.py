@@ -357,7 +357,7 @@ def _smooth_samples(
 ) -> tuple[Float[np.ndarray, "samples variables"], Float[np.ndarray, "samples n_states"]]:
     """The library's variables, inside its domain, and the derivatives of the states."""
     smooth, slopes = [], []
-    for each in run.stretches():
+    for each in run.segments():
         samples = each.columns(library.variables)
         inside = noise_inside(library, samples)
         smooth.append(keep_inside(library, smoother.smooth(each.t, samples), inside))

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
 
-# A start that is less than this share of what the first rates add tells no size of the state.
+# A start that is less than this fraction of what the first rates add tells no size of the state.
 NEGLIGIBLE = 1e-12
 
 
@@ -52,9 +52,9 @@ class Rollout:
     def band(
         self, level: float = 0.9
     ) -> tuple[Float[np.ndarray, "samples n_states"], Float[np.ndarray, "samples n_states"]]:
-        """Lower and upper bound between which this share of the draws lies at each time.
+        """Lower and upper bound between which this fraction of the draws lies at each time.
 
-        Raises ValueError for a run without draws, or a level that is no share.
+        Raises ValueError for a run without draws, or a level that is no fraction.
         """
         if self.draws is None:
             raise ValueError("a band needs draws: ask for them, simulate(..., draws=100)")

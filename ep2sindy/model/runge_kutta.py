@@ -14,7 +14,7 @@ import numpy as np
 
 
 class Tableau(NamedTuple):
-    """An explicit scheme of four stages, in shares of a step.
+    """An explicit scheme of four stages, in fractions of a step.
 
     leads: (4, 4), weight of each earlier slope in the state of a stage; weights: (4,), of the
     slopes in the end of the step. places: (4,), of the stages among the positions at which inputs

@@ -17,15 +17,15 @@ from ep2sindy.model.solve import Driven, solve_stages
 from ep2sindy.model.vector_field import VectorField, entries_of
 from ep2sindy.runtime.values import check_positive, locked, read_only
 
-# A multiplier whose modulus is this close to one counts as neutral: a departure then takes at least
-# a thousand periods to change e-fold, longer than any record. The multipliers themselves are exact
-# to 1e-6 or better.
+# A multiplier whose modulus is this close to one counts as neutral: a perturbation then takes at
+# least a thousand periods to change e-fold, longer than any record. The multipliers themselves are
+# exact to 1e-6 or better.
 NEUTRAL_WITHIN = 1e-3
 
-# Largest modulus, after that of the flow, at which a cycle is trusted to attract: a departure
+# Largest modulus, after that of the flow, at which a cycle is trusted to attract: a perturbation
 # halves within 14 periods. Data of a few periods cannot tell weaker attraction from none. And the
 # smallest at which a cycle repels; a neutral cycle's is one but for errors of its coefficients.
-PULL, PUSH = 0.95, 1.003
+ATTRACTING_BELOW, REPELLING_ABOVE = 0.95, 1.003
 
 # If no orbit is found near the start, Newton's method begins again this many periods later.
 N_SETTLING = 10
@@ -38,8 +38,8 @@ REACHED_WITHIN, N_LATE = 0.1, 3.0
 # the stability limit of the fourth-order scheme (2.8).
 MIN_STEPS, STEP_TIMES_RATE = 64, 1.0
 
-# A departure from an attracting cycle is waited for until it has shrunk to e^-3, a twentieth, over
-# a number of periods between these.
+# A perturbation from an attracting cycle is waited for until it has shrunk to e^-3, a twentieth,
+# over a number of periods between these.
 SHRUNK, LEAST_WAIT, MOST_WAIT = 3.0, 40.0, 400.0
 
 # A run is given up as diverged when it is BLOW_UP times as far from the cycle's mean as the
@@ -52,7 +52,7 @@ class LimitCycle:
     """A periodic orbit of an autonomous model, with its Floquet multipliers.
 
     states: over one period, evenly spaced, the first not repeated, in SI. multipliers: Floquet
-    multipliers, by which a small departure grows in every period; that of the flow itself (1)
+    multipliers, by which a small perturbation grows in every period; that of the flow itself (1)
     first, the others by decreasing modulus. model: whose orbit it is.
     """
 
@@ -79,7 +79,7 @@ class LimitCycle:
 
     @property
     def stability(self) -> str:
-        """Attracting, neutral or repelling: a small departure decays, persists or grows.
+        """Attracting, neutral or repelling: a small perturbation decays, persists or grows.
 
         By the largest of the other multipliers; neutral if it is within 1e-3 of one.
         """
@@ -139,7 +139,7 @@ def _backwards(
     return LimitCycle(cycle.period_s, states, np.append(inverse[0], inverse[:0:-1]), model)
 
 
-def share_reaching(
+def basin_stability(
     model: SparseModel,
     cycle: LimitCycle,
     *,
@@ -147,7 +147,7 @@ def share_reaching(
     n_periods: float | None = None,
     spread: tuple[float, float] = (0.3, 3.0),
 ) -> float:
-    """Share of starts that end on a cycle: within 0.1 of it over their last three periods.
+    """Fraction of starts that end on a cycle: within 0.1 of it over their last three periods.
 
     n_periods: that are waited for; None takes `periods_to_reach`.
 
@@ -173,7 +173,7 @@ def share_reaching(
 
 
 def periods_to_reach(cycle: LimitCycle) -> float:
-    """Periods in which a departure from an attracting cycle shrinks to a twentieth, 40 to 400.
+    """Periods in which a perturbation from an attracting cycle shrinks to a twentieth, 40 to 400.
 
     Forty where nothing decays: what is on another cycle of a neutral family stays there.
     """
@@ -268,7 +268,7 @@ def _check_reach(
     if n_starts < 1 or not (np.isfinite(n_periods) and n_periods > N_LATE):
         raise ValueError(
             f"one start or more and over {N_LATE:g} periods are needed, of which the last "
-            f"{N_LATE:g} are judged, got n_starts={n_starts}, n_periods={n_periods}"
+            f"{N_LATE:g} are assessed, got n_starts={n_starts}, n_periods={n_periods}"
         )
     if not 0.0 < spread[0] < spread[1] < np.inf:
         raise ValueError(f"spread must be two positive factors, the lower first, got {spread}")
@@ -296,13 +296,15 @@ CLOSED_WITHIN = 1e-7
 # standard deviations. The longest step of the period is a fifth of LONGEST, in guessed periods.
 N_NEWTON, LONGEST = 25, 1.0
 
-# Singular values below this share of the largest count as zero: the direction of an orbit family.
+# Singular values below this fraction of the largest count as zero: the direction of an orbit
+# family.
 RCOND = 1e-7
 
 # Search range of the first return, and allowed range of the period, in guessed periods.
 RETURNS, PERIODS = (0.7, 1.3), (0.5, 2.0)
 
-# An orbit that varies less than this share of the first run's standard deviation is a fixed point.
+# An orbit that varies less than this fraction of the first run's standard deviation is a fixed
+# point.
 STILL = 1e-3
 
 # Samples of a run per guessed period.
@@ -340,7 +342,7 @@ def _find_orbit(
     run = run[n_settling * N_SAMPLES :]
     scale = deviations(run)
     field = model.field.scaled(scale, period_s)
-    departing = Driven(field.with_departures())
+    departing = Driven(field.with_perturbations())
     first, last = (round(N_SAMPLES * r) for r in RETURNS)
     distance = np.linalg.norm((run[first : last + 1] - run[0]) / scale, axis=1)
     period = float(first + distance.argmin()) / N_SAMPLES
@@ -429,7 +431,7 @@ def _newton_step(
 def _path(
     departing: Driven, y: np.ndarray, times: np.ndarray, *, rtol: float
 ) -> Float[np.ndarray, "times n_states_and_departures"] | None:
-    """States from y, then the departures that n unit ones become; None if the run is given up."""
+    """States from y, then what n unit perturbations become; None if the run is given up."""
     n = len(y)
     found = solve_stages(
         departing,

@@ -117,8 +117,8 @@ class VectorField:
     @cached_property
     def weights(self) -> Float[np.ndarray, "d columns products"]:
         """Weights W of the products in the rates, then in their derivatives by each state."""
-        shares, used = self.library.with_derivatives(self.n_states)[1], self.coef.any(axis=1)
-        found: np.ndarray = np.tensordot(self.coef[used].T, shares[used], axes=1)
+        fractions, used = self.library.with_derivatives(self.n_states)[1], self.coef.any(axis=1)
+        found: np.ndarray = np.tensordot(self.coef[used].T, fractions[used], axes=1)
         return found
 
     @property
@@ -139,11 +139,11 @@ class VectorField:
         values, terms = self.library.at_points(self.library.variables)
         return values, lambda: terms() @ self.coef
 
-    def with_departures(self) -> VectorField:
-        """The states of a model without inputs, then d departures y of d states each.
+    def with_perturbations(self) -> VectorField:
+        """The states of a model without inputs, then d perturbations y of d states each.
 
-        A departure follows the linearised equations y_j' = sum_v df_j/dx_v y_v, whose terms are the
-        products of the Jacobian times a component of the departure.
+        A perturbation follows the linearised equations y_j' = sum_v df_j/dx_v y_v, whose terms are
+        the products of the Jacobian times a component of the perturbation.
         """
         d, factors = self.n_states, self.products.exponents
         names = [f"{state}_{r}" for r in range(d) for state in self.library.variables]

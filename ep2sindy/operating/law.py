@@ -48,9 +48,9 @@ class OperatingLaw:
     functions: of the parameters. library: of the states. coefficients: (state, term) of each row of
     coef, in SI. covariance: of coef.ravel(), None if unknown. points: the operating points of the
     fit, columns in the order of the functions' variables. left_out: for each point, the error of
-    the rates that the law of the other points gives it, as a share of its rates; None if the points
-    do not suffice for a law without each of them.
-    Source: Rudy et al. 2019, doi:10.1137/18M1191944, for coefficients that depend on a parameter.
+    the rates that the law of the other points gives it, as a fraction of its rates; None if the
+    points do not suffice for a law without each of them. Source: Rudy et al. 2019,
+    doi:10.1137/18M1191944, for coefficients that depend on a parameter.
 
     >>> functions, library = ep.polynomial(["a"], degree=1), ep.polynomial(["x"], degree=1)
     >>> pairs, points = (("x", "x"),), np.array([[0.0], [2.0]])
@@ -382,22 +382,22 @@ def constrain_law(
     """
     given = library.facts.relations
     functions = named_terms(list(parameters), ["1"])
-    told = {}
+    stated = {}
     for (state, term), factors in library.facts.known_factors.items():
         own = functions_of_point(parameters, f"{state}: {term}", factors)
         functions = functions + own
-        told[state, term] = dict(zip(own.names, factors.values(), strict=True))
+        stated[state, term] = dict(zip(own.names, factors.values(), strict=True))
     columns = []
     for name in functions.names:
         # Relations are linear in their values: one function of the parameters at a time.
         values = [replace(r, value=r.value if name == "1" else 0.0) for r in given]
         values += [
             Relation(((1.0, state, term),), factors.get(name, 0.0), _text(state, term, factors))
-            for (state, term), factors in told.items()
+            for (state, term), factors in stated.items()
         ]
         columns.append(constraint(library, structure, values))
     common = replace(columns[0], d=np.zeros(len(columns[0].d)))
-    texts = [r.text for r in given] + [_text(*pair, factors) for pair, factors in told.items()]
+    texts = [r.text for r in given] + [_text(*pair, factors) for pair, factors in stated.items()]
     if texts and not len(common.free):
         raise ValueError(f"a law needs a free coefficient: {texts} leave none; drop one of them")
     return LawConstraint(common, functions, np.column_stack([c.d for c in columns]), tuple(texts))

@@ -13,7 +13,7 @@ from ep2sindy.forecasting.evaluation import Evaluation, evaluate
 from ep2sindy.library.library import Library
 from ep2sindy.model.comparison import Status
 from ep2sindy.model.model import SparseModel
-from ep2sindy.model.stability import PULL
+from ep2sindy.model.stability import ATTRACTING_BELOW
 from ep2sindy.operating.law import read_law
 from ep2sindy.operating.point_fits import PointFits
 from ep2sindy.operating.records import OperatingRecord
@@ -41,7 +41,7 @@ class LeftOutRun:
     @property
     def attracts(self) -> bool:
         """True if the run ends on a cycle that attracts, and so sets the amplitude by itself."""
-        return self.run.multiplier < PULL
+        return self.run.multiplier < ATTRACTING_BELOW
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +111,7 @@ def error_statistics(left_out: Sequence[LeftOutRun]) -> dict[str, float | int]:
     waveform = np.array([max(each.run.waveform_error.values()) for each in left_out])
     return {
         "n": len(left_out),
-        "n_lives": sum(each.run.status is Status.SUSTAINED for each in left_out),
+        "n_sustained": sum(each.run.status is Status.SUSTAINED for each in left_out),
         "diverging": sum(each.run.rollout.diverged for each in left_out),
         "f_median": float(np.median(f)),
         "f_90": float(np.quantile(f, 0.9, method="higher")),

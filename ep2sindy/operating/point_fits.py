@@ -24,7 +24,7 @@ from ep2sindy.operating.law import (
     make_basis,
     read_coefficients,
 )
-from ep2sindy.refinement.judge import RefinementStatus
+from ep2sindy.refinement.assess import RefinementStatus
 from ep2sindy.refinement.problem import RefinementSettings
 from ep2sindy.refinement.refine import Refinement, refine
 from ep2sindy.regression.constrained import solve_constrained
@@ -113,9 +113,7 @@ class PointFits:
     def columns(self, functions: Library) -> Float[np.ndarray, "points variables"]:
         """The parameters of the points in the order of the functions' variables."""
         if unknown := [v for v in functions.variables if v not in self.parameters]:
-            raise ValueError(
-                f"a law's functions must be of {list(self.parameters)}, got {unknown}"
-            )
+            raise ValueError(f"a law's functions must be of {list(self.parameters)}, got {unknown}")
         return self.points[:, [self.parameters.index(v) for v in functions.variables]]
 
     def law(self, functions: Library) -> OperatingLaw:
@@ -146,7 +144,7 @@ class PointFits:
         )
 
     def rate_errors(self, functions: Library) -> Float[np.ndarray, " points"]:
-        """Error at each point of the law of the others, as a share of the point's rates.
+        """Error at each point of the law of the others, as a fraction of the point's rates.
 
         With z_p and I_p of the point, and d_p what the law of the others misses z_p by, it is
         sqrt(d_p^T I_p d_p / z_p^T I_p z_p): for rows, the root mean square error of the rates by

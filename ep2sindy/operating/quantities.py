@@ -24,7 +24,7 @@ from ep2sindy.runtime.values import check_count, read_only
 
 LEVEL = 0.95  # level of all intervals in this file
 
-# Share of the values' RMS: errors below it are rounding, and the law with fewer terms wins.
+# Fraction of the values' RMS: errors below it are rounding, and the law with fewer terms wins.
 ROUNDING = 1e-10
 
 POINTS_PER_TERM = 3  # points for each term of a control law: with fewer, a search fits their errors
@@ -212,7 +212,8 @@ def _search(
 ) -> tuple[list[int], np.ndarray, np.ndarray]:
     """Columns of a law, their coefficients, and values at points left out.
 
-    Of all supports up to a size, one of fewest terms whose error cannot be told from the least.
+    Of all supports up to a size, one of fewest terms whose error cannot be distinguished from the
+    least.
     """
     n_points, n_terms = theta.shape
     largest = max(1, min(n_terms, n_points - 2, max_terms))
@@ -282,8 +283,8 @@ def fit_trend(
     if std is not None:
         reach = float(ndtri(0.5 + 0.5 * LEVEL) * np.linalg.norm(weights * std / values))
     line = logs.mean() + slope * centred
-    share = float(r2(truth=logs, prediction=line[None])[0]) if np.ptp(logs) > 0.0 else nothing
-    return Trend(slope, share, slope - reach, slope + reach, n)
+    fraction = float(r2(truth=logs, prediction=line[None])[0]) if np.ptp(logs) > 0.0 else nothing
+    return Trend(slope, fraction, slope - reach, slope + reach, n)
 
 
 def lines_of(

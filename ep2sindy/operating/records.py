@@ -13,8 +13,8 @@ from jaxtyping import Float, Int
 from ep2sindy.data.numbers import least_squares, zero_to_one
 from ep2sindy.data.trajectory import Trajectory, check_agreement, point_label
 from ep2sindy.signals.attractor import Cycle, find_cycle
+from ep2sindy.signals.signal import MIN_PERIODS
 from ep2sindy.signals.spectrum import relative_amplitude, steps_in
-from ep2sindy.signals.trace import MIN_PERIODS
 
 Point = Mapping[str, float]  # parameter -> value
 

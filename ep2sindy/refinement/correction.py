@@ -14,7 +14,7 @@ from torch import nn
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.model.model import SparseModel
-from ep2sindy.refinement.judge import RefinementStatus, is_flat, rollout, status_of
+from ep2sindy.refinement.assess import RefinementStatus, is_flat, rollout, status_of
 from ep2sindy.refinement.methods.gradient_descent import GradientDescent
 from ep2sindy.refinement.ode import ScaledEquations
 from ep2sindy.refinement.problem import (
@@ -35,7 +35,7 @@ SETTINGS = RefinementSettings(n_reweights=0)
 DESCENT = GradientDescent(max_iter=60, tolerance=1e-3, patience=5)
 
 # A step is fine enough if halving it changes the trajectories (rms, in std) by less than the larger
-# of these: a share of the rms residual, and an absolute value.
+# of these: a fraction of the rms residual, and an absolute value.
 ERROR_PER_RESIDUAL, MIN_ERROR = 0.1, 1e-3
 
 
@@ -149,7 +149,7 @@ def _result(
     """Result in SI; holds the model and term given if the fit did not stay finite."""
     (equations,), (batch,), term = problem.equations, problem.batches, problem.correction
     assert isinstance(term, _Scaled)
-    window_loss, status = _judge(problem, fit, n_substeps)
+    window_loss, status = _assess(problem, fit, n_substeps)
     unchanged = replace(fit, scaling=np.ones_like(fit.scaling), nodes=known.data)
     trained = status is not RefinementStatus.NON_FINITE
     scaling = (fit if trained else unchanged).scaling[0]
@@ -206,7 +206,7 @@ def _check_shape(term: nn.Module, known: ScaledEquations, device: str) -> None:
         )
 
 
-def _judge(
+def _assess(
     problem: RefinementProblem, fit: RefinementFit, n_substeps: int
 ) -> tuple[Float[np.ndarray, " windows"], RefinementStatus]:
     """The loss of each window, and the most severe status that applies."""

@@ -80,8 +80,7 @@ class RefinementSettings:
                 )
             if not self.periods > 0.0:
                 raise ValueError(
-                    f"periods must be positive, got {self.periods}; leave it out for one and a "
-                    "half"
+                    f"periods must be positive, got {self.periods}; leave it out for one and a half"
                 )
 
     def override(self, given: RefinementChanges) -> RefinementSettings:
@@ -261,7 +260,7 @@ class RefinementProblem:
 
 @dataclass(frozen=True, eq=False)
 class RefinementFit:
-    """Result of a method, point by point, before it is judged.
+    """Result of a method, point by point, before it is assessed.
 
     scaling: padded with ones beyond a model's own scalings. nodes: the fitted trajectories at the
     samples, in std. weights: the last ones used. finished: true if the method's own convergence

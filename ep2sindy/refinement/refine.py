@@ -15,11 +15,11 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.relations import Constraint
 from ep2sindy.model.display import model_html, model_lines
 from ep2sindy.model.model import SparseModel
-from ep2sindy.refinement.judge import (
+from ep2sindy.refinement.assess import (
     RefinementStatus,
     RefinementVerdict,
     failure,
-    fit_and_judge,
+    fit_and_assess,
     follow_windows,
 )
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
@@ -218,7 +218,7 @@ def _refine(
         observe=observe,
         device=device,
     )
-    fit, verdicts = fit_and_judge(problem, settings.method or MultipleShooting())
+    fit, verdicts = fit_and_assess(problem, settings.method or MultipleShooting())
     return [
         _result(model, problem, fit, p, verdict, history)
         for p, (model, verdict) in enumerate(zip(models, verdicts, strict=True))

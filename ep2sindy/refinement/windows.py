@@ -91,12 +91,12 @@ def cut_windows(
     spread, rms = joined[:, :n].std(axis=0), np.sqrt(np.square(joined[:, n:]).mean(axis=0))
     scale = zero_to_one(np.append(spread, rms))
     step_s = mean_step(*(each.t for each in trajectories))
-    stretches = np.array(
+    segments = np.array(
         [(j, *each) for j, run in enumerate(trajectories) for each in between_gaps(run.t)]
-    )  # trajectory, first and last sample (exclusive) of every stretch without a gap
-    lengths = (stretches[:, 2] - stretches[:, 1]).tolist()
+    )  # trajectory, first and last sample (exclusive) of every segment without a gap
+    lengths = (segments[:, 2] - segments[:, 1]).tolist()
     piece, start = _places(lengths, n_windows, window, rng)
-    index, start = stretches[piece, 0], start + stretches[piece, 1]
+    index, start = segments[piece, 0], start + segments[piece, 1]
     known = [(courses or {}).get(name) for name in inputs]
     cubics = [
         curve_through(each.t, v[:, n:] / scale[n:], known).pieces.transpose(1, 0, 2)
@@ -120,14 +120,14 @@ def dominant_window(
 ) -> int:
     """Length in samples of `periods` periods of the dominant frequency, as far as data allow.
 
-    The frequency is that of the state whose peak holds the largest share of its power. The
-    length is the median over trajectories, and at most half of the longest stretch without a gap.
+    The frequency is that of the state whose peak holds the largest fraction of its power. The
+    length is the median over trajectories, and at most half of the longest segment without a gap.
     Raises ValueError for no trajectory.
     """
     longest, samples = _longest(trajectories), []
     for each in trajectories:
         columns = each.columns(states).T
-        sharpest = columns[int(np.argmax([_peak_share(each.t, column) for column in columns]))]
+        sharpest = columns[int(np.argmax([_peak_fraction(each.t, column) for column in columns]))]
         frequency = dominant_frequency(each.t, sharpest)
         if frequency > 0.0:
             samples.append(steps_in(periods, frequency_Hz=frequency, dt_s=each.dt_s))
@@ -135,8 +135,8 @@ def dominant_window(
     return int(np.clip(round(float(wanted)), min(10, longest), max(longest // 2, 10)))
 
 
-def _peak_share(t: np.ndarray, x: np.ndarray) -> float:
-    """Share of the power, without the mean, in the highest bin and its neighbours."""
+def _peak_fraction(t: np.ndarray, x: np.ndarray) -> float:
+    """Fraction of the power, without the mean, in the highest bin and its neighbours."""
     power = power_spectrum(t, x)[1][1:]
     k = int(np.argmax(power))
     return float(power[max(k - 1, 0) : k + 2].sum() / max(power.sum(), 1e-300))
@@ -152,7 +152,7 @@ def check_windows(n_windows: int, window: int | None) -> None:
 
 
 def _longest(trajectories: Sequence[Trajectory]) -> int:
-    """Samples in the longest stretch without a gap; ValueError for no trajectory."""
+    """Samples in the longest segment without a gap; ValueError for no trajectory."""
     if not trajectories:
         raise ValueError("refinement needs at least one trajectory, got none")
     return max(stop - start for run in trajectories for start, stop in between_gaps(run.t))
@@ -170,10 +170,10 @@ def _check_room(trajectories: Sequence[Trajectory], window: int) -> None:
 def _places(
     lengths: Sequence[int], n_windows: int, window: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Stretch and first sample of every window, in proportion to the room in the stretches."""
+    """Segment and first sample of every window, in proportion to the room in the segments."""
     room = np.array([max(n - window + 1, 0) for n in lengths])
-    share = np.minimum(np.round(n_windows * np.cumsum(room) / room.sum()), np.cumsum(room))
-    counts = np.minimum(np.diff(share, prepend=0.0).astype(int), room)
+    fraction = np.minimum(np.round(n_windows * np.cumsum(room) / room.sum()), np.cumsum(room))
+    counts = np.minimum(np.diff(fraction, prepend=0.0).astype(int), room)
     firsts = [_spread(int(r), int(m), window, rng) for r, m in zip(room, counts, strict=True)]
     return np.repeat(np.arange(len(lengths)), counts), np.concatenate(firsts)
 

@@ -1,4 +1,4 @@
-"""Detection of terms that the data cannot tell apart: zero, repeated, nearly so, dependent."""
+"""Detection of terms that the data cannot distinguish: zero, repeated, nearly so, dependent."""
 
 from __future__ import annotations
 

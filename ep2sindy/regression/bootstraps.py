@@ -30,7 +30,7 @@ class Bootstraps:
 
     A search sees one pair per draw. Assumes that the groups of rows are exchangeable; with block
     above 1, that rows farther apart than a block are uncorrelated.
-    Each of the `n` draws takes, with replacement, a random share of the training groups
+    Each of the `n` draws takes, with replacement, a random fraction of the training groups
     between `smallest` and `largest`, and leaves out `n_culled` random terms.
     block: number of neighbouring training groups drawn together. 1 draws single groups, as in the
     thesis, and understates the scatter for a time series, whose neighbours are correlated. More
@@ -40,7 +40,7 @@ class Bootstraps:
 
     >>> thesis = ep.Regression(ep.Differential(), ep.AdaptiveLasso(), ep.Knee(), ep.Bootstraps(50))
     >>> run = ep.lotka_volterra().trajectory(noise=0.01, rng=0)
-    >>> ep.discover(run, method=thesis, seed=0).chosen["x"].share  # of draws with these terms
+    >>> ep.discover(run, method=thesis, seed=0).chosen["x"].fraction  # of draws with these terms
     0.64
     """
 
@@ -54,7 +54,7 @@ class Bootstraps:
         set_counts(self, {"n": 0, "n_culled": 0, "block": 1})
         if not 0.0 < self.smallest <= self.largest:
             raise ValueError(
-                "shares must satisfy 0 < smallest <= largest, got "
+                "fractions must satisfy 0 < smallest <= largest, got "
                 f"smallest={self.smallest}, largest={self.largest}"
             )
 
@@ -77,7 +77,7 @@ class Bootstraps:
             parts = [half.draw(problem, terms, rng) for half in halves]
             return np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts])
         group = problem.groups[~problem.test]
-        if (group[1:] > group[:-1]).all():  # each row alone, which is told at a tenth of the cost
+        if (group[1:] > group[:-1]).all():  # each row alone, which is stated at a tenth of the cost
             counts, kept = self.draw_groups(len(group), terms, rng)
             return problem.resampled_products(counts), kept
         numbers, group = np.unique(group, return_inverse=True)
@@ -96,8 +96,8 @@ class Bootstraps:
             )
         counts, kept = np.empty((self.n, n_groups)), np.repeat(terms[None], self.n, axis=0)
         for k in range(self.n):
-            share = self.smallest + (self.largest - self.smallest) * rng.random()
-            n_drawn = max(1, round(share * n_groups))
+            fraction = self.smallest + (self.largest - self.smallest) * rng.random()
+            n_drawn = max(1, round(fraction * n_groups))
             counts[k] = count_block_draws(n_groups, n_drawn=n_drawn, block=self.block, rng=rng)
             kept[k, rng.permutation(usable)[: self.n_culled]] = False
         return counts, kept
@@ -107,15 +107,15 @@ class Bootstraps:
 class Supports:
     """Supports that the bootstraps found for one equation, pooled.
 
-    masks: (supports, terms), each once. share: (supports,), share of bootstraps that found the
-    support. inclusion: (terms + 1, terms); row k is the share of bootstraps, among those whose
-    library held the term, in which the term was in a support of k terms. Without bootstraps both
-    are NaN.
+    masks: (supports, terms), each once. fraction: (supports,), fraction of bootstraps that found
+    the support. inclusion: (terms + 1, terms); row k is the fraction of bootstraps, among those
+    whose library held the term, in which the term was in a support of k terms. Without bootstraps
+    both are NaN.
     """
 
     equation: str
     masks: Bool[np.ndarray, "supports terms"]
-    share: Float[np.ndarray, " supports"]
+    fraction: Float[np.ndarray, " supports"]
     inclusion: Float[np.ndarray, "sizes terms"]
 
 
@@ -242,7 +242,7 @@ def pool(draws: Resamples, equation: int, found: Sequence[Bool[np.ndarray, "_ te
     return Supports(
         equation=draws.equations[equation],
         masks=masks,
-        share=in_draw.mean(axis=0) + unknown,
+        fraction=in_draw.mean(axis=0) + unknown,
         inclusion=held / np.maximum(draws.kept.sum(axis=0), 1) + unknown,
     )
 

@@ -19,8 +19,8 @@ from ep2sindy.regression.least_squares import LeastSquares
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.whitening import WhitenedRows, whiten_rows
 
-# Lower bound on the residual, as a share of the target's RMS; it limits the weight of an equation
-# with an exact fit.
+# Lower bound on the residual, as a fraction of the target's RMS; it limits the weight of an
+# equation with an exact fit.
 MIN_RESIDUAL = 1e-6
 
 MIN_BLOCKS = 5  # fewest blocks of time in a record: fewer say too little about how these differ
@@ -49,7 +49,7 @@ def constrained_fit(
     that of the residuals.
 
     problems: as a formulation assembles them. The model has the constraint's states.
-    Raises ValueError for a state without rows, or coefficients that these rows cannot tell apart.
+    Raises ValueError for a state without rows, or coefficients that these rows cannot distinguish.
     """
     solution = solve_constrained(problems, constraint)
     if not solution.fit.is_determined:
@@ -88,7 +88,7 @@ class ConstrainedSolution:
         """The same for rows that depend on each other within blocks of time.
 
         block: number of consecutive groups in a block. The covariance is a sandwich with the blocks
-        as clusters: how far other stretches of the record would move the coefficients.
+        as clusters: how far other segments of the record would move the coefficients.
         Raises ValueError for fewer than five blocks.
         Source: Liang & Zeger 1986, doi:10.1093/biomet/73.1.13.
         """

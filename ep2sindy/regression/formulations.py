@@ -36,7 +36,7 @@ class Split(Protocol):
 
 @dataclass(frozen=True)
 class RandomSplit:
-    """Hold out a random share of the groups of each trajectory, as in the thesis."""
+    """Hold out a random fraction of the groups of each trajectory, as in the thesis."""
 
     test_fraction: float = 0.25
 
@@ -92,7 +92,7 @@ class Differential:
     def assemble(
         self, trajectories: Sequence[Trajectory], library: Library, *, rng: np.random.Generator
     ) -> tuple[RegressionRows, ...]:
-        """Stack the rows of all trajectories; every row uses samples of one stretch without a gap.
+        """Stack the rows of all trajectories; every row uses samples of one segment without a gap.
 
         All equations share their rows, so there is one regression.
         Raises ValueError for no trajectory, trajectories with different states, or a variable of
@@ -100,7 +100,7 @@ class Differential:
         """
         check_agreement(trajectories, library.variables)
         check_domain(trajectories, library, smooth=self.smooth_library)
-        pieces = [piece for run in trajectories for piece in run.stretches()]
+        pieces = [piece for run in trajectories for piece in run.segments()]
         n_samples = [run.n_samples for run in pieces]
         values = np.empty((sum(n_samples), len(library.variables)))
         target = np.empty((len(values), len(trajectories[0].state_names)))
@@ -190,7 +190,7 @@ class Weak:
         """
         check_agreement(trajectories, library.variables)
         check_domain(trajectories, library, smooth=self.smooth_library)
-        pieces = [piece for run in trajectories for piece in run.stretches()]
+        pieces = [piece for run in trajectories for piece in run.segments()]
         runs = [self._sample(piece, library, rng) for piece in pieces]
         states = range(len(runs[0].windows))
         return tuple(self._problem(k, runs, library, trajectories) for k in states)
@@ -277,7 +277,7 @@ class Weak:
 
 @dataclass(frozen=True, eq=False)
 class _Sampled:
-    """Terms, windows of each state, and segments of one stretch of samples without gaps.
+    """Terms, windows of each state, and segments of one segment of samples without gaps.
 
     names: the library's variables, then states that it lacks.
     segment: (samples,), number of the time segment that holds the sample. held_out: (samples,),
@@ -302,10 +302,10 @@ class _Sampled:
         windows = self.windows[state]
         first, last = windows.first, windows.last
         n_held_out = np.append(0, np.cumsum(self.held_out))
-        share = (n_held_out[last + 1] - n_held_out[first]) / (last + 1 - first)
-        pure = (share == 0.0) | (share == 1.0)
+        inside = (n_held_out[last + 1] - n_held_out[first]) / (last + 1 - first)
+        pure = (inside == 0.0) | (inside == 1.0)
         segment = self.segment[(first + last) // 2]
-        return windows.taken(pure), segment[pure], share[pure] == 1.0
+        return windows.taken(pure), segment[pure], inside[pure] == 1.0
 
 
 @dataclass(frozen=True)
@@ -371,7 +371,7 @@ class WeightedWeak:
         )
 
 
-# Noise below this share of an input's standard deviation is negligible beside that of any state.
+# Noise below this fraction of an input's standard deviation is negligible beside that of any state.
 NEGLIGIBLE = 1e-3
 
 MAX_LEVELS = 8  # levels of a switched input at most; a noisy record has more, however coarse

@@ -41,13 +41,13 @@ class Candidate:
     weighted by their noise; from a search of trajectories: the most likely values given the other
     equations.
     r2_train, r2_test: 1 - SS_res/SS_tot with the data as truth; NaN if there are no such rows.
-    share: share of bootstraps that found this support. inclusion: for each of its terms, the share
-    of bootstraps in which the term was in a support of this size. Both are NaN without bootstraps.
-    deviance: -2 log likelihood of whole trajectories plus the penalty for the terms, relative to
-    the best system; None if only rows were fitted.
-    score: value of the selection rule, the lowest of the front being selected; NaN before
-    selection. covariance: (terms, terms) of coef after a weighted fit, in SI; None if the noise of
-    the rows is not known, or if the residuals exceed it. left: residuals of that fit.
+    fraction: fraction of bootstraps that found this support. inclusion: for each of its terms, the
+    fraction of bootstraps in which the term was in a support of this size. Both are NaN without
+    bootstraps. deviance: -2 log likelihood of whole trajectories plus the penalty for the terms,
+    relative to the best system; None if only rows were fitted. score: value of the selection rule,
+    the lowest of the front being selected; NaN before selection. covariance: (terms, terms) of coef
+    after a weighted fit, in SI; None if the noise of the rows is not known, or if the residuals
+    exceed it. left: residuals of that fit.
     """
 
     equation: str
@@ -55,7 +55,7 @@ class Candidate:
     coef: Float[np.ndarray, " support"]
     r2_train: float
     r2_test: float
-    share: float
+    fraction: float
     inclusion: Float[np.ndarray, " support"]
     deviance: float | None = None
     score: float = float("nan")
@@ -84,7 +84,7 @@ class Candidate:
 
 
 @dataclass(frozen=True, eq=False)
-class Cloud:
+class Ensemble:
     """Number of terms and error of every distinct support that a search proposed.
 
     errors: 1 - R2 as in `ParetoFront.errors`, but from Gram matrices only, so an exact fit has an
@@ -102,14 +102,15 @@ class ParetoFront:
     `pareto_front` sorts them by size, and within a size by error. The first candidates of the
     sizes form the front proper, along which the error decreases; the others are runners-up. A
     search shared by several points ranks by all of them, so errors may increase at one point.
-    problem: rows that the candidates were fitted to; None for a search of trajectories. cloud:
-    all supports that the candidates were taken from; None if the front was not made from a cloud.
+    problem: rows that the candidates were fitted to; None for a search of trajectories. ensemble:
+    all supports that the candidates were taken from; None if the front was not made from a
+    ensemble.
     """
 
     equation: str
     candidates: Sequence[Candidate]
     problem: RegressionRows | None = field(default=None, repr=False)
-    cloud: Cloud | None = field(default=None, repr=False)
+    ensemble: Ensemble | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "candidates", tuple(self.candidates))
@@ -121,7 +122,7 @@ class ParetoFront:
         """Rows of the regression. Raises ValueError if there are none."""
         if self.problem is None:
             raise ValueError(
-                f"rows are needed to judge the candidates of {self.equation!r}; a search of "
+                f"rows are needed to assess the candidates of {self.equation!r}; a search of "
                 "trajectories has none, and a discovery that was stored keeps none: take a "
                 "regression, such as Regression(WeightedWeak())"
             )
@@ -234,13 +235,13 @@ def pareto_front(problem: RegressionRows, supports: Supports, *, depth: int = 1)
     chosen = Supports(
         equation=supports.equation,
         masks=np.concatenate([empty, supports.masks[best]]),
-        share=np.append(supports.share[sizes == 0].sum(), supports.share[best]),
+        fraction=np.append(supports.fraction[sizes == 0].sum(), supports.fraction[best]),
         inclusion=supports.inclusion,
     )
     found = _fit(problem, chosen)
     order = order_front(np.append(0, sizes[best]), errors_of(found), depth=depth)
-    cloud = _cloud(problem, supports, explained)
-    return ParetoFront(supports.equation, [found[k] for k in order], problem, cloud)
+    ensemble = _ensemble(problem, supports, explained)
+    return ParetoFront(supports.equation, [found[k] for k in order], problem, ensemble)
 
 
 def order_front(
@@ -268,32 +269,32 @@ def _rank(
     `depth` supports that reduce it most of each size, ordered by size.
     """
     equation, sizes = problem.equations.index(supports.equation), supports.masks.sum(axis=1)
-    train, judge = problem.train_gram, _judging_gram(problem)
+    train, assess = problem.train_gram, _assessing_gram(problem)
     coef = fit_masks(train.xx, train.xy[equation], supports.masks)
-    explained = explained_squares(coef, judge.xx, judge.xy[equation])
+    explained = explained_squares(coef, assess.xx, assess.xy[equation])
     order = np.lexsort((-explained, sizes))
     order = order[np.isfinite(explained[order]) & (sizes[order] > 0)]
     rank = np.arange(len(order)) - np.searchsorted(sizes[order], sizes[order])
     return explained, order[rank < depth]
 
 
-def _judging_gram(problem: RegressionRows) -> Grams:
+def _assessing_gram(problem: RegressionRows) -> Grams:
     """Gram matrices of the held-out rows, or of the training rows if none are held out."""
     return problem.test_gram if problem.test.any() else problem.train_gram
 
 
-def _cloud(
+def _ensemble(
     problem: RegressionRows, supports: Supports, explained: Float[np.ndarray, " supports"]
-) -> Cloud:
+) -> Ensemble:
     """Sizes and errors of all supports.
 
     The sum of squares about the mean is not zero here: `r2_of` would have raised before.
     """
     equation = problem.equations.index(supports.equation)
     spread = _squares_about_mean(problem, equation, test=bool(problem.test.any()))
-    errors = (_judging_gram(problem).yy[equation] - explained) / spread
+    errors = (_assessing_gram(problem).yy[equation] - explained) / spread
     fitted = np.isfinite(errors)
-    return Cloud(supports.masks.sum(axis=1)[fitted], errors[fitted])
+    return Ensemble(supports.masks.sum(axis=1)[fitted], errors[fitted])
 
 
 def _fit(problem: RegressionRows, supports: Supports) -> list[Candidate]:
@@ -319,7 +320,7 @@ def _fit(problem: RegressionRows, supports: Supports) -> list[Candidate]:
             coef=coef_SI[k, mask],
             r2_train=float(r2_train[k]),
             r2_test=float(r2_test[k]),
-            share=float(supports.share[k]),
+            fraction=float(supports.fraction[k]),
             inclusion=supports.inclusion[np.count_nonzero(mask), mask],
         )
         for k, mask in enumerate(masks)

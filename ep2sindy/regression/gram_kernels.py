@@ -13,10 +13,10 @@ from ep2sindy.runtime.compilation import INNER_REORDERED, LOOPS, REORDERED, comp
 
 WITHIN = {**LOOPS, "no_cpython_wrapper": True}  # for kernels that only kernels call
 
-# A column counts as dependent on others if their residual of its square falls below this share.
+# A column counts as dependent on others if their residual of its square falls below this fraction.
 DEPENDENT = 1e-11
 
-# A residual of the target's square below this share counts as rounding.
+# A residual of the target's square below this fraction counts as rounding.
 ROUNDING = 1e-15
 
 

@@ -16,10 +16,10 @@ from jaxtyping import Bool, Float
 from ep2sindy.data.numbers import column_norms
 from ep2sindy.regression.gram_kernels import DEPENDENT, fit_masks, solve_masks
 
-# Correction of coefficients, as a share of them, after which another one would be rounding.
+# Correction of coefficients, as a fraction of them, after which another one would be rounding.
 REFINED = 1e-9
 
-# Share of the largest singular value of dependent columns below which a direction stays out.
+# Fraction of the largest singular value of dependent columns below which a direction stays out.
 CUTOFF = float(np.sqrt(DEPENDENT))
 
 ROWS_AT_ONCE = 4096  # rows whose residuals, of all fits, are held at once

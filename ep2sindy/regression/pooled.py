@@ -18,8 +18,9 @@ from ep2sindy.data.numbers import column_norms, zero_to_one
 from ep2sindy.regression.least_squares import LeastSquares
 from ep2sindy.runtime.values import read_only
 
-# Functions whose columns of unit norm have a singular value below this share of the largest cannot
-# be told apart at the points. They are exact numbers, so this is far below what rows allow.
+# Functions whose columns of unit norm have a singular value below this fraction of the largest
+# cannot be distinguished at the points. They are exact numbers, so this is far below what rows
+# allow.
 RANK = 1e-10
 
 # A point with this leverage alone determines some coefficient: without it there is no fit.
@@ -89,7 +90,7 @@ class Basis:
 
 
 def fewest_of_least(trials: Sequence[tuple[Float[np.ndarray, " points"], int]]) -> int:
-    """Index of the trial with fewest numbers whose mean error cannot be told from the least.
+    """Index of the trial with fewest numbers whose mean error is not above the least.
 
     trials: errors at each point, and a count of numbers. The difference of the errors from the
     least, point by point, must be within one standard error.

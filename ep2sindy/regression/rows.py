@@ -189,7 +189,7 @@ class RegressionRows:
         check_memory(
             each * n_draws + products_of_rows,
             f"Gram matrices of {len(self.library)} terms in {n_draws} bootstraps",
-            way_out="lower bootstraps.n, take fewer terms, or a lower degree",
+            hint="lower bootstraps.n, take fewer terms, or a lower degree",
             each=each,
         )
 

@@ -109,7 +109,7 @@ class STLSQ:
         set_counts(self, {"n_thresholds": 2, "max_terms": 1})
 
     def supports(self, xx: Gram, xy: Products, yy: float) -> Masks:
-        start, thresholds = independent_terms(xx), np.sqrt(yy) * self._shares
+        start, thresholds = independent_terms(xx), np.sqrt(yy) * self._fractions
         # The first fit, of all terms, is the same at every threshold.
         masks = start & (np.abs(fit_masks(xx, xy, start[None])) > thresholds[:, None])
         threshold_terms(xx, xy, thresholds, masks)
@@ -117,7 +117,7 @@ class STLSQ:
         return masks[masks.sum(axis=1) <= (self.max_terms or len(xy))]
 
     @cached_property
-    def _shares(self) -> Float[np.ndarray, " thresholds"]:
+    def _fractions(self) -> Float[np.ndarray, " thresholds"]:
         return np.geomspace(self.lowest, self.highest, self.n_thresholds)
 
 
@@ -187,7 +187,7 @@ def find_best_subsets(
     check_memory(
         8.0 * (depth + 1) * len(xy) * (n_terms + 1.0) ** 2,
         f"Gram matrices of {n_terms} terms at each of {depth} sizes",
-        way_out="lower max_terms, take fewer terms, or a lower degree",
+        hint="lower max_terms, take fewer terms, or a lower degree",
     )
     # Branches are cut sooner if the columns closest to the targets come first.
     order = np.argsort(-np.square(xy).sum(axis=0), kind="stable")
@@ -311,11 +311,11 @@ class _Problems:
         """Residual if each term joins the chosen ones; infinite for one that depends on them."""
         columns, target = self.xx[:, :, chosen], self.xy[:, chosen]
         inverse = invert_gram(columns[:, chosen])
-        share = columns @ inverse
+        fraction = columns @ inverse
         square = np.einsum("pjj->pj", self.xx)
-        own = square - np.einsum("pjs,pjs->pj", share, columns)
+        own = square - np.einsum("pjs,pjs->pj", fraction, columns)
         adds = own > DEPENDENT * square
-        gain = np.square(self.xy - np.einsum("pjs,ps->pj", share, target))
+        gain = np.square(self.xy - np.einsum("pjs,ps->pj", fraction, target))
         left = self.yy - np.einsum("ps,pst,pt->p", target, inverse, target)
         residuals = left[:, None] - np.where(adds, gain / np.where(adds, own, 1.0), 0.0)
         residuals = np.maximum(residuals, ROUNDING * self.yy[:, None])

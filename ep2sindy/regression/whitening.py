@@ -27,13 +27,13 @@ RIDGE = 1e-8
 
 ROUNDING = 1e-8
 
-# Largest rise of the misfit per row above the least so far. At 20 % noise whole steps have raised
+# Largest rise of the cost per row above the least so far. At 20 % noise whole steps have raised
 # it by 6, and the next step brought it back; diverging steps raise it by 14 to 1600.
 RISE = 10.0
 
 MAX_HALVED = 6
 
-# Change of the scaled coefficients, as a share of them, after which no step follows.
+# Change of the scaled coefficients, as a fraction of them, after which no step follows.
 SETTLED = 1e-8
 
 # Change of them by a step that is not worth making if only the residuals are wanted: these are
@@ -71,18 +71,18 @@ def whiten_rows(
     order they are M e, with covariance M Sigma M^T. Each step is a Gauss-Newton step to the jointly
     most likely coefficients and samples: fit the coefficients with weights, correct the samples by
     the most likely noise, linearise again. Without the correction, the noise in the terms would
-    bias the coefficients. A step that raises the misfit too far is halved.
+    bias the coefficients. A step that raises the cost too far is halved.
     coef: (terms,), a first guess in scaled columns. negligible: change of the coefficients, as a
-    share of them, for which no step is made. kept: terms whose columns are wanted, at least those
-    of the model; None for all.
-    Source: Bortz, Messenger & Dukic 2023, doi:10.1007/s11538-023-01208-6, for the covariance;
-    Britt & Luecke 1973, Technometrics 15, 233, for the steps.
+    fraction of them, for which no step is made. kept: terms whose columns are wanted, at least
+    those of the model; None for all. Source: Bortz, Messenger & Dukic 2023,
+    doi:10.1007/s11538-023-01208-6, for the covariance; Britt & Luecke 1973, Technometrics 15, 233,
+    for the steps.
     """
     assert problem.noisy is not None
     kept = np.ones_like(terms) if kept is None else kept
     sums, terms = _Sums.of(problem, kept), terms[kept]
     rows = _Linearised.at(problem, sums, problem.noisy.columns[1], coef[kept], noisy=False)
-    least = rows.misfit
+    least = rows.cost
     for _ in range(n_steps):
         before, coef = rows.coef, rows.fit(terms)
         if _is_near(before, coef, negligible):
@@ -90,7 +90,7 @@ def whiten_rows(
         following = _step(problem, sums, rows, coef, limit=least + RISE * len(rows.target))
         if following is None:
             break
-        rows, least = following, min(least, following.misfit)
+        rows, least = following, min(least, following.cost)
         if _is_near(before, rows.coef, SETTLED):
             break
     theta = np.zeros((len(rows.target), len(kept)))
@@ -103,11 +103,11 @@ def whiten_rows(
 
 
 def _is_near(
-    before: Float[np.ndarray, " terms"], after: Float[np.ndarray, " terms"], share: float
+    before: Float[np.ndarray, " terms"], after: Float[np.ndarray, " terms"], fraction: float
 ) -> bool:
-    """Whether coefficients differ by less than a share of the latter; never for a share of 0."""
+    """Whether coefficients differ by less than a fraction of the latter; never for 0."""
     change = after - before
-    return bool(change @ change < share**2 * (after @ after))
+    return bool(change @ change < fraction**2 * (after @ after))
 
 
 def _step(
@@ -118,20 +118,23 @@ def _step(
     *,
     limit: float,
 ) -> _Linearised | None:
-    """One Gauss-Newton step to coefficients, halved until the misfit decreases; None if never.
+    """One Gauss-Newton step to coefficients, halved until the cost decreases; None if never.
 
-    limit: largest misfit allowed after a whole step.
+    limit: largest cost allowed after a whole step.
     """
     x = np.ascontiguousarray(keep_inside(problem.library, rows.correct(coef).T, rows.x.T).T)
     whole = _Linearised.at(problem, sums, x, coef)
-    if whole.misfit <= limit:
+    if whole.cost <= limit:
         return whole
     for n_halved in range(1, MAX_HALVED + 1):
-        share = 0.5**n_halved
+        fraction = 0.5**n_halved
         part = _Linearised.at(
-            problem, sums, rows.x + share * (x - rows.x), rows.coef + share * (coef - rows.coef)
+            problem,
+            sums,
+            rows.x + fraction * (x - rows.x),
+            rows.coef + fraction * (coef - rows.coef),
         )
-        if part.misfit < rows.misfit:
+        if part.cost < rows.cost:
             return part
     return None
 
@@ -140,31 +143,31 @@ class _Sums(NamedTuple):
     """Some scaled terms and their derivatives, as sums of products.
 
     kept: (library terms,), mask of the terms. products: library of the products, of which the rows
-    of `table` are used. shares: (kept, products), of the terms, then of their derivatives by each
-    variable.
+    of `table` are used. fractions: (kept, products), of the terms, then of their derivatives by
+    each variable.
     """
 
     kept: Bool[np.ndarray, " terms"]
     products: Library
     table: Int[np.ndarray, "products factors"]
-    shares: Sequence[csr_array]
+    fractions: Sequence[csr_array]
 
     @staticmethod
     def of(problem: RegressionRows, kept: Bool[np.ndarray, " terms"]) -> _Sums:
         library = problem.library
-        products, shares = library.with_derivatives(len(library.variables))
-        shares = shares[kept] / problem.theta_scale[kept, None, None]
-        used = shares.any(axis=(0, 1))
-        parts = [csr_array(share) for share in shares[:, :, used].transpose(1, 0, 2)]
+        products, fractions = library.with_derivatives(len(library.variables))
+        fractions = fractions[kept] / problem.theta_scale[kept, None, None]
+        used = fractions.any(axis=(0, 1))
+        parts = [csr_array(fraction) for fraction in fractions[:, :, used].transpose(1, 0, 2)]
         return _Sums(kept, products, products.table[used], parts)
 
     def linearise(
         self,
         x: Float[np.ndarray, "variables samples"],
-        departure: Float[np.ndarray, "variables samples"],
+        perturbation: Float[np.ndarray, "variables samples"],
         coef: Float[np.ndarray, " kept"],
     ) -> tuple[Float[np.ndarray, "two kept samples"], Float[np.ndarray, "variables samples"]]:
-        """Terms at x, terms moved by a departure along their derivatives, and slopes of the model.
+        """Terms at x, terms moved along their derivatives, and slopes of the model.
 
         The slopes are those of the sum of coef times term, by each variable.
         """
@@ -172,11 +175,11 @@ class _Sums(NamedTuple):
         values = columns[self.table[:, 0]]
         for factor in self.table.T[1:]:
             values *= columns[factor]
-        own, *derivatives = self.shares
+        own, *derivatives = self.fractions
         terms, sensitivity = np.stack([own @ values] * 2), np.empty(x.shape)
-        for v, share in enumerate(derivatives):
-            slopes = share @ values
-            terms[1] += slopes * departure[v]
+        for v, fraction in enumerate(derivatives):
+            slopes = fraction @ values
+            terms[1] += slopes * perturbation[v]
             sensitivity[v] = coef @ slopes
         return terms, sensitivity
 
@@ -230,7 +233,7 @@ class _Linearised:
         return _Linearised(x, coef, theta, drifted, target, sensitivity, factor, target_scale, rows)
 
     @property
-    def misfit(self) -> float:
+    def cost(self) -> float:
         """-2 log likelihood of the rows, up to a constant.
 
         The residuals alone are not sufficient: large coefficients amplify the modelled noise, and
@@ -269,8 +272,8 @@ def _lift(
     """Mean change of terms with functions by the noise left in the samples, to second order.
 
     For example, sin(x + e) is on average sin(x) exp(-s^2/2), a bias that weighting does not
-    correct. Products of variables are not changed. The share of the noise variance s^2 that is left
-    in the samples is one minus the number of rows per sampled value.
+    correct. Products of variables are not changed. The fraction of the noise variance s^2 that is
+    left in the samples is one minus the number of rows per sampled value.
     """
     rows, library = problem.noisy, problem.library
     assert rows is not None

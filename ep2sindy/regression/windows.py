@@ -1,4 +1,4 @@
-"""Windows of weak rows: test functions on stretches of neighbouring samples, as weighted sums.
+"""Windows of weak rows: test functions on segments of neighbouring samples, as weighted sums.
 
 Samples at unequal steps are first brought to an even grid.
 """
@@ -22,9 +22,9 @@ Signal = Float[np.ndarray, " samples"]
 
 @dataclass(frozen=True, eq=False)
 class Windows:
-    """Test functions phi on stretches of neighbouring samples, one for every row.
+    """Test functions phi on segments of neighbouring samples, one for every row.
 
-    mean, slope: (rows, samples), weights that are stored for all samples of each row's stretch and
+    mean, slope: (rows, samples), weights that are stored for all samples of each row's segment and
     for no others. mean @ values is the integral of phi * values divided by that of phi. slope @ x
     is the integral of phi * x' divided by that of phi, computed by parts without differencing x.
     """
@@ -267,16 +267,16 @@ def spectral_change_point(x: Signal) -> int:
         at, at * (at + 1.0) / 2.0, at * (at + 1.0) * (2.0 * at + 1.0) / 6.0,
         *(np.cumsum(each)[until] for each in (total, bins * total, total**2)),
     ])  # fmt: skip
-    misfit = np.zeros(len(corners))
+    cost = np.zeros(len(corners))
     for first, end in ((np.s_[:1], np.s_[1:-1]), (np.s_[1:-1], np.s_[-1:])):
         low = total[until[first]]
         rise = (total[until[end]] - low) / (at[end] - at[first])
         start = low - rise * at[first]
-        # Squares of the bins after the first one; at both ends of a chord there is no misfit.
+        # Squares of the bins after the first one; at both ends of a chord the fit is exact.
         n, k, kk, y, ky, yy = sums[:, end] - sums[:, first]
-        misfit += yy + n * start**2 + kk * rise**2
-        misfit += 2.0 * (k * start * rise - y * start - ky * rise)
-    return int(corners[np.argmin(misfit)])
+        cost += yy + n * start**2 + kk * rise**2
+        cost += 2.0 * (k * start * rise - y * start - ky * rise)
+    return int(corners[np.argmin(cost)])
 
 
 def _check_width(n_points: int, n_samples: int, name: str) -> None:
@@ -304,8 +304,8 @@ def even_grid(
     n_steps = max(1, round(float((t[-1] - t[0]) / np.median(np.diff(t)))))
     grid = np.linspace(t[0], t[-1], n_steps + 1)
     left = np.clip(np.searchsorted(t, grid, side="right") - 1, 0, len(t) - 2)
-    share = (grid - t[left]) / (t[left + 1] - t[left])
-    weights = np.stack([1.0 - share, share], axis=1)
+    fraction = (grid - t[left]) / (t[left + 1] - t[left])
+    weights = np.stack([1.0 - fraction, fraction], axis=1)
     columns = np.stack([left, left + 1], axis=1)
     starts = np.arange(0, 2 * len(grid) + 1, 2)
     lines = csr_array((weights.ravel(), columns.ravel(), starts), shape=(len(grid), len(t)))

@@ -59,7 +59,7 @@ class Report:
     summary: dict[str, Any] = field(default_factory=dict)
     headline: dict[str, float] = field(default_factory=dict)
     result: Result | None = None
-    said: list[str] = field(default_factory=list)
+    stated: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     ends: list[Callable[[], None]] = field(default_factory=list)
 
@@ -152,7 +152,7 @@ class Report:
     def say(self, text: str, *, warning: bool = False) -> None:
         """Print a message at once, on the screen and in run.log, and repeat it on the page."""
         if not warning:
-            self.said.append(text)
+            self.stated.append(text)
         self.screen.print(*renderables(Text(text, warning=warning)))
 
     def warn(self, text: str) -> None:
@@ -182,7 +182,7 @@ class Report:
 
         purpose: of the experiment, in a sentence. keys: of the settings that it uses. formats: of
         the files of figures, none of which is drawn without one.
-        Raises ValueError if the study has not said what it found.
+        Raises ValueError if the study has not reported what it found.
         """
         if self.result is None:
             raise ValueError(f"a study must say what it found, report.found(...): {self.title}")
@@ -218,7 +218,7 @@ class Report:
         return About(
             purpose=purpose,
             asked=settings_used(self.settings, keys),
-            said=self.said,
+            stated=self.stated,
             warnings=self.warnings,
             provenance=self.provenance,
             config=(self.folder.path / "config.yaml").read_text("utf-8"),

@@ -180,7 +180,7 @@ def json_rows(table: pd.DataFrame) -> list[dict[Any, Any]]:
 
 
 def percent(digits: int, *, sign: bool = False) -> Callable[[float], str]:
-    """A format of shares such as `12.3 %`, with a dash for a missing number."""
+    """A format of fractions such as `12.3 %`, with a dash for a missing number."""
 
     def text(value: float) -> str:
         return f"{100.0 * value:{'+' if sign else ''}.{digits}f} %" if isfinite(value) else "-"

@@ -22,7 +22,7 @@ from ep2sindy.runtime.user_cache import cache_folder
 from ep2sindy.trust.user_code import PACKAGE
 
 THIS = Path(__file__)
-SHARED = PACKAGE / "__pycache__" / "kernels"  # of `ep2sindy warm --shared`
+SHARED = PACKAGE / "__pycache__" / "kernels"  # of `ep2sindy precompile --shared`
 IMPORT = re.compile(r"^from (ep2sindy(?:\.\w+)+) import", re.MULTILINE)
 
 ANNOUNCEMENT = "ep2sindy: compiling its kernels, once after installation (half a minute) ..."

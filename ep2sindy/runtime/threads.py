@@ -31,7 +31,7 @@ def one_thread() -> Iterator[None]:
     """Compute on one thread within this context, also in PyTorch if it is loaded.
 
     The previous number of threads is restored by the last to leave, since threads of Python that
-    compute at once share the pools. Also works as a decorator.
+    compute at once . Also works as a decorator.
     """
     torch = sys.modules.get("torch")  # not imported here, since the import is slow
     n_threads = torch.get_num_threads() if torch else 1

@@ -1,4 +1,4 @@
-"""Systems judged on windows that they were not refined on, for records without a cycle."""
+"""Systems assessed on windows that they were not refined on, for records without a cycle."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from ep2sindy.selection.criteria import FLOOR, MAX_ERROR
 from ep2sindy.selection.systems import (
     Confirmed,
     Fold,
-    Stretch,
+    Segment,
     Trial,
     TrialSystem,
-    cut_stretches,
+    cut_segments,
     deal,
     plan_refinement,
 )
@@ -37,22 +37,21 @@ N_ERRORS = 2.0
 class WindowsLeftOut:
     """Errors of systems on windows that share no samples with those that they were refined on.
 
-    For judging, coefficients are held and each window's start is fitted: from a smoothed start even
-    the true system, if it is chaotic, runs away from its own samples.
-    The error is the mean square distance to the samples in variances of each state, averaged over
-    the states with weights 1 / residual of the leader, the system of greatest likelihood. It is at
-    most 10, which also stands for a window that a system cannot run through. A refinement that
-    blows up, or that does not converge and follows its own windows no better, keeps the
-    coefficients of the regression, which are judged like any other.
-    Its bound is two standard errors above the leader's. The standard error is that of the
-    difference between the two errors, in which noise that both meet cancels: with n independent
-    residuals an excess share of q in the error has the standard error sqrt(4 q / n), so q = 16 / n
-    is two of them. n is the number of residuals times (1 - rho) / (1 + rho), rho being the
-    autocorrelation of the leader's residuals from sample to sample. So differences between models
-    that miss more than white noise are uncertain.
+    For assessing, coefficients are held and each window's start is fitted: from a smoothed start
+    even the true system, if it is chaotic, runs away from its own samples. The error is the mean
+    square distance to the samples in variances of each state, averaged over the states with weights
+    1 / residual of the leader, the system of greatest likelihood. It is at most 10, which also
+    stands for a window that a system cannot run through. A refinement that blows up, or that does
+    not converge and follows its own windows no better, keeps the coefficients of the regression,
+    which are assessed like any other. Its bound is two standard errors above the leader's. The
+    standard error is that of the difference between the two errors, in which noise that both meet
+    cancels: with n independent residuals an excess fraction of q in the error has the standard
+    error sqrt(4 q / n), so q = 16 / n is two of them. n is the number of residuals times (1 - rho)
+    / (1 + rho), rho being the autocorrelation of the leader's residuals from sample to sample. So
+    differences between models that miss more than white noise are uncertain.
 
     runs: the records between their gaps. spread: standard deviation of each state over all runs.
-    n_windows: that are judged, over all records, each in one fold.
+    n_windows: that are assessed, over all records, each in one fold.
     """
 
     runs: Sequence[Trajectory]
@@ -70,7 +69,7 @@ class WindowsLeftOut:
         wanted = min(dominant_window(self.runs, self.states), sum(lengths) // (2 * MIN_PAIRS))
         if max(lengths) < 2 * MIN_SAMPLES:
             raise ValueError(
-                "a record must hold a window to refine on and another to judge on, of "
+                "a record must hold a window to refine on and another to assess on, of "
                 f"{MIN_SAMPLES} samples or more, got at most {max(lengths)}; use longer records"
             )
         return min(max(wanted, MIN_SAMPLES), max(lengths) // 2)
@@ -87,17 +86,17 @@ class WindowsLeftOut:
             n_pairs = min(n_pairs, length // (2 * window))
             last = max(length - 2 * window, 0)
             for start in np.linspace(0, last, n_pairs).round().astype(np.int64).tolist():
-                found += [Stretch(number, k, k + window) for k in (start, start + window)]
+                found += [Segment(number, k, k + window) for k in (start, start + window)]
         return deal(found, self.n_folds)
 
-    def count(self, stretches: Sequence[Stretch]) -> int:
-        """Number of windows: each stretch is one."""
-        return len(stretches)
+    def count(self, segments: Sequence[Segment]) -> int:
+        """Number of windows: each segment is one."""
+        return len(segments)
 
     def admits(self, system: TrialSystem) -> bool:
         return bool(system.model.coef.any())
 
-    def judge(
+    def assess(
         self,
         systems: Sequence[TrialSystem],
         refined: BatchRefinement,
@@ -114,7 +113,7 @@ class WindowsLeftOut:
         )
         for k in doubtful[worse >= better]:
             models[k] = before[k]
-        held = cut_stretches(
+        held = cut_segments(
             self.runs, fold.held, before[0], window=self.window, n_windows=self.count(fold.held)
         )
         return _residuals(models, held, progress) * (held.scale[: len(self.spread)] / self.spread)
@@ -123,13 +122,13 @@ class WindowsLeftOut:
         """Errors in units of their bound, zero up to the bound, as those systems are alike."""
         errors, bound = _errors_and_bound(np.concatenate(tried, axis=1))
         unknown = np.full_like(errors, np.nan)
-        shares = np.where(errors > bound, np.minimum(errors / bound, MAX_ERROR), 0.0)
-        return np.column_stack([shares, unknown, unknown, errors, errors])
+        fractions = np.where(errors > bound, np.minimum(errors / bound, MAX_ERROR), 0.0)
+        return np.column_stack([fractions, unknown, unknown, errors, errors])
 
     def confirm(self, trial: Trial, model: SparseModel) -> Confirmed:
         """A system is confirmed if its coefficients, refined on all data, meet the demands."""
         broken = trial.system.broken(model)
-        return Confirmed(trial, model, broken, share=float(not broken))
+        return Confirmed(trial, model, broken, fraction=float(not broken))
 
 
 def _residuals(

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from ep2sindy.data.coerce import Task, noise_inside
 from ep2sindy.data.numbers import column_norms
 from ep2sindy.library.relations import Place, Process
-from ep2sindy.library.roles import Roles, constraint_of, shares_of
+from ep2sindy.library.roles import Roles, constraint_of, fractions_of
 from ep2sindy.regression.constrained import MIN_RESIDUAL
 from ep2sindy.regression.front import ParetoFront, fit_supports
 from ep2sindy.regression.gram_kernels import fit_masks
@@ -30,15 +30,15 @@ def search_conserving_systems(
 
         minimise sum over equations e of |y_e - X_e (A_e z + d_e)|^2 / s_e^2 over supports of z
 
-    z holds one amount per process, and column p of A_e its share in every term of equation e, d_e
-    what is known. So a search proposes processes, and what they move is conserved exactly. s_e is
-    the standard deviation of what the whole library leaves of y_e; assumes residuals that are
+    z holds one amount per process, and column p of A_e its fraction in every term of equation e,
+    d_e what is known. So a search proposes processes, and what they move is conserved exactly. s_e
+    is the standard deviation of what the whole library leaves of y_e; assumes residuals that are
     independent between rows and equations. Of every size, the `depth` best systems are kept in
-    which every role is played by a process, and those that must be positive are: least squares
-    with these bounds would put another to zero, which is a smaller system. problems: rows of the
-    task's library with the terms of known equations, `with_known_terms`.
-    Raises ValueError for roles that do not fit the task, or if no system plays them all.
-    Called by `ep.discover(run, library.with_roles(roles), method)` for a method such as
+    which every role is played by a process, and those that must be positive are: least squares with
+    these bounds would put another to zero, which is a smaller system. problems: rows of the task's
+    library with the terms of known equations, `with_known_terms`. Raises ValueError for roles that
+    do not fit the task, or if no system plays them all. Called by `ep.discover(run,
+    library.with_roles(roles), method)` for a method such as
     ep.Regression(selection=ep.FreeRunScore()); docs/roles.md shows what comes of it.
     """
     processes = roles.processes(task.library, task.states)
@@ -83,10 +83,10 @@ def _join_rows(
     library, columns, targets = task.library, [], []
     for problem in problems:
         for k, state in enumerate(problem.equations):
-            shares = np.array(
+            fractions = np.array(
                 [[p.factors.get((state, term), 0.0) for p in processes] for term in library.names]
             )
-            if not shares.any():
+            if not fractions.any():
                 continue  # the whole equation is known
             fixed = np.array([known.get((state, term), 0.0) for term in library.names])
             target = problem.scaled_target(k)
@@ -94,7 +94,7 @@ def _join_rows(
             left = target - theta @ LeastSquares.of_rows(theta, target).coef
             std = max(float(left.std()), MIN_RESIDUAL * float(np.sqrt(np.square(target).mean())))
             theta = theta / problem.coef_scale(k) / std
-            columns.append(theta @ shares)
+            columns.append(theta @ fractions)
             targets.append(target / std - theta @ fixed)
     return np.concatenate(columns), np.concatenate(targets)
 
@@ -135,12 +135,12 @@ def _build_system(
     means: Float[np.ndarray, " processes"] | None,
 ) -> TrialSystem | None:
     """The system of these processes; None if its coefficients do not tell them apart."""
-    held = constraint_of(task.library, task.states, processes, roles.told)
+    held = constraint_of(task.library, task.states, processes, roles.stated)
     if held is None:
         return None
     known = roles.known
-    told = np.array([known.get(held.coefficients[k], 0.0) for k in held.free])
-    return TrialSystem.of(task, held, shares_of(held) @ values + told, means)
+    stated = np.array([known.get(held.coefficients[k], 0.0) for k in held.free])
+    return TrialSystem.of(task, held, fractions_of(held) @ values + stated, means)
 
 
 def _average_terms(task: Task, processes: Sequence[Process]) -> Float[np.ndarray, " processes"]:

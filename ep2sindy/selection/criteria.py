@@ -26,7 +26,7 @@ Basis = Literal["rows", "likelihood", "runs"]
 
 @dataclass(frozen=True)
 class OtherSystem:
-    """A system of as many free coefficients as the selected one, which lives too.
+    """A sustained system of as many free coefficients as the selected one.
 
     terms: by equation, such as `n_i'`, or under roles by role, such as `n_n to n_i`. Figures are
     the worst over the folds that the system was not fitted to. deviation: of frequency, amplitudes
@@ -78,7 +78,7 @@ class Selection(Protocol):
     def decide(self, fronts: Fronts, task: Task, *, progress: Progress = SILENT) -> Decision: ...
 
 
-# Least residual squares, as a share of the target's squares: below this value a criterion would
+# Least residual squares, as a fraction of the target's squares: below this value a criterion would
 # select terms that fit the discretisation error of noise-free data.
 FLOOR = 1e-6
 

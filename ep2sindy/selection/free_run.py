@@ -26,7 +26,7 @@ from ep2sindy.model.comparison import (
 from ep2sindy.model.inputs import curve_through
 from ep2sindy.model.many import WindowSteps, run_many
 from ep2sindy.model.model import SparseModel
-from ep2sindy.model.stability import LEAST_WAIT, PULL, PUSH, share_reaching
+from ep2sindy.model.stability import ATTRACTING_BELOW, LEAST_WAIT, REPELLING_ABOVE, basin_stability
 from ep2sindy.model.vector_field import VectorField
 from ep2sindy.refinement.refine import BatchRefinement
 from ep2sindy.refinement.windows import MIN_SAMPLES, WindowBatch
@@ -38,13 +38,13 @@ from ep2sindy.selection.criteria import MAX_ERROR, Basis, Decision
 from ep2sindy.selection.systems import (
     Confirmed,
     Fold,
-    Stretch,
+    Segment,
     Systems,
     Trial,
     TrialSystem,
     combine,
-    cut_stretches,
-    find_living,
+    cut_segments,
+    find_sustained,
     folds,
     list_others,
     order_equals,
@@ -66,7 +66,7 @@ N_SUBSTEPS = 2
 # A state that is farther from its mean than this many standard deviations has diverged.
 BLOW_UP = 20.0
 
-N_REACHING = 64  # starts around a cycle that are run, for the share that reaches it
+N_REACHING = 64  # starts around a cycle that are run, for the fraction that reaches it
 
 # Fewest periods of a record, so that its folds leave windows of two periods: six, less a margin
 # for noise.
@@ -76,44 +76,43 @@ MIN_PERIODS = 5.5
 # direction, from each third to the next: no single cycle then fits all folds within 10 %.
 MAX_DRIFT = 1.1
 
-# Periods of a trial run: enough for a transient to die out. A model without inputs continues
-# beyond the end of a short stretch.
+# Periods of a trial run: enough for a transient to decay. A model without inputs continues
+# beyond the end of a short segment.
 MIN_RUN, MAX_RUN = 16.0, 30.0
 
 
 @dataclass(frozen=True)
 class FreeRunScore:
-    """Judge systems of equations by running them; the smallest that lives where not fitted wins.
+    """Assess systems by free runs; the smallest that is sustained where it was not fitted wins.
 
     The records are split into `n_folds`. Every combination of candidates, one per equation, is
     refined on windows of `window_periods` in all folds but one, then run freely over the fold held
     out, in turn for every fold. A run starts on the data's cycle at the phase where the held-out
     part begins, not at its first sample, whose noise is not the model's fault. A model with inputs
-    starts at the smoothed sample instead. A system lives if frequency, amplitudes and waveform stay
-    within `bounds` of the data's cycle in every run.
-    Living systems within `margin` come first; among these the smallest, and among equals the one
-    with the best waveform, is refined on windows of all data and run over the longest record. It
-    wins if it lives there too, on a cycle that nine of ten starts around it reach; if fewer do, one
-    that they reach wins with the same number of coefficients or one more, else that of least size
-    and most such starts. A system on a neutral cycle wins only if no equal or larger system on an
-    attracting cycle follows the data as well. Size is the number of free coefficients. If no system
-    lives, the one that deviates least wins, and the note says so. Neither R2 nor the loss of the
-    windows decides which systems live: they are blind to where a trajectory ends. Only if some
-    systems follow the samples to rounding, because the truth is in the library, these compete
-    alone.
+    starts at the smoothed sample instead. A system is sustained if frequency, amplitudes and
+    waveform stay within `bounds` of the data's cycle in every run. Self-sustained systems within
+    `margin` come first; among these the smallest, and among equals the one with the best waveform,
+    is refined on windows of all data and run over the longest record. It wins if it is sustained
+    there too, on a cycle that nine of ten starts around it reach; if fewer do, one that they reach
+    wins with the same number of coefficients or one more, else that of least size and most such
+    starts. A system on a neutral cycle wins only if no equal or larger system on an attracting
+    cycle follows the data as well. Size is the number of free coefficients. If no system is
+    sustained, the one that deviates least wins, and the note says so. Neither R2 nor the loss of
+    the windows decides which systems are sustained: they are blind to where a trajectory ends. Only
+    if some systems follow the samples to rounding, because the truth is in the library, these
+    compete alone.
 
-    Windows of the fold held out are judged instead if a record has no period, holds fewer than
+    Windows of the fold held out are assessed instead if a record has no period, holds fewer than
     six, or spirals outward or inward throughout, as there is no cycle to compare with; see
     `WindowsLeftOut`. Of the systems that follow them as well as any, the smallest wins.
     score = the largest deviation from the cycle, in units of its bound, or the error over windows,
-    in units of the largest that cannot be told from the least; at most 10.
-    bounds: None judges windows of every record, for cycles that do not repeat, such as chaos.
-    margin: systems that deviate by no more than this share of the bounds come first, even if others
-    are smaller: a system that barely stays within the bounds here will leave them in another
-    record.
-    judged: states whose cycle counts, for example the one that was measured if the others are
-    derived from it; None takes all. n_starts: number of runs over every held-out part for models
-    without inputs, at phases spread over the period; all must end on the cycle.
+    in units of the largest that cannot be distinguished from the least; at most 10.
+    bounds: None tests windows of every record, for cycles that do not repeat, such as chaos.
+    margin: systems that deviate by no more than this fraction of the bounds come first, even if
+    others are smaller: a system that barely stays within the bounds here will leave them in another
+    record. assessed: states whose cycle counts, for example the one that was measured if the others
+    are derived from it; None takes all. n_starts: number of runs over every held-out part for
+    models without inputs, at phases spread over the period; all must end on the cycle.
     max_combinations: of more, the most promising are tried, those whose candidates rank best in
     their own fronts; the note says so. n_confirmed: most systems to refine on all data. seed: of
     the random windows.
@@ -127,7 +126,7 @@ class FreeRunScore:
     n_confirmed: int = 8
     seed: int = 0
     max_combinations: int = 4096
-    judged: Sequence[str] | None = None
+    assessed: Sequence[str] | None = None
     n_starts: int = 1
     label: ClassVar[str] = "free-run error"
     basis: ClassVar[Basis] = "runs"
@@ -141,7 +140,7 @@ class FreeRunScore:
             raise ValueError(f"window_periods must be positive, got {self.window_periods}")
         if not 0.0 < self.margin <= 1.0:
             raise ValueError(f"margin must lie between 0 and 1, got {self.margin}")
-        check_list("judged", self.judged)
+        check_list("assessed", self.assessed)
 
     def decide(self, fronts: Fronts, task: Task, *, progress: Progress = SILENT) -> Decision:
         """Score candidates by the deviations of their combinations, and refine the winner.
@@ -150,30 +149,30 @@ class FreeRunScore:
         that no combination has the terms for.
         """
         systems = combine(fronts, task, most=self.max_combinations)
-        return self.judge(systems, task.runs, progress=progress)
+        return self.assess(systems, task.runs, progress=progress)
 
-    def judge(
+    def assess(
         self, found: Systems, runs: Sequence[Trajectory], *, progress: Progress = SILENT
     ) -> Decision:
         """Decide among given systems, as `decide` does among the combinations of candidates.
 
         Each is refined without a fold and run over that fold, in turn for every fold. Those that
-        live are ranked, and refined on all data in this order until one is confirmed.
+        are sustained are ranked, and refined on all data in this order until one is confirmed.
         """
         measure, reason = self._measure(found.fronts, runs)
         trials = self._try(found.systems, measure, progress)
-        living = find_living(trials)
-        ranked = order_equals(sorted(living, key=lambda trial: trial.rank(self.margin)))
+        sustained = find_sustained(trials)
+        ranked = order_equals(sorted(sustained, key=lambda trial: trial.rank(self.margin)))
         by_error = sorted(trials, key=lambda trial: (trial.error, trial.loss))
         confirmed = self._confirm(ranked or by_error, measure, runs, progress)
         won = min(confirmed, key=lambda each: each.rank)
         scores = found.score(np.array([t.error for t in trials]), trials.index(won.trial))
-        note = f"{reason}{won.text(len(living), len(trials))}{found.left_out}"
-        others = list_others(living, won.trial) if won.run else ()
+        note = f"{reason}{won.text(len(sustained), len(trials))}{found.left_out}"
+        others = list_others(sustained, won.trial) if won.run else ()
         return Decision(scores, won.model, note, won.trial.system.constraint, others)
 
     def _measure(self, fronts: Fronts, runs: Sequence[Trajectory]) -> tuple[Measure, str]:
-        """What systems are judged by; and why not by their cycles, if these were asked for.
+        """What systems are assessed by; and why not by their cycles, if these were asked for.
 
         Raises ValueError for a state without a front.
         """
@@ -188,14 +187,14 @@ class FreeRunScore:
         if self.bounds is not None and not isinstance(cycles, str):
             parts = folds(runs, self.n_folds)
             return CycleRuns(self, runs, parts, smoothed, cycles, self.bounds), ""
-        pieces = [piece for run in runs for piece in run.stretches(2 * MIN_SAMPLES)]
+        pieces = [piece for run in runs for piece in run.segments(2 * MIN_SAMPLES)]
         spread, reason = np.concatenate(smoothed).std(axis=0), f"{cycles}: " if cycles else ""
         return WindowsLeftOut(pieces, spread, states, self.n_windows, self.n_folds), reason
 
     def _try(
         self, systems: Sequence[TrialSystem], measure: Measure, progress: Progress
     ) -> list[Trial]:
-        """Refine every system without a fold, and judge it on that fold, in turn for every fold."""
+        """Refine every system without a fold, and assess it there, in turn for every fold."""
         some = [k for k, system in enumerate(systems) if measure.admits(system)]
         some.sort(key=lambda k: systems[k].n_free)  # systems in a batch then cost about the same
         trials = [Trial(system) for system in systems]
@@ -203,12 +202,12 @@ class FreeRunScore:
             return trials
         tried, found = [systems[k] for k in some], []
         for fold in measure.folds:
-            fitted = cut_stretches(
+            fitted = cut_segments(
                 measure.runs, fold.fitted, tried[0].model, window=measure.window,
                 n_windows=measure.count(fold.fitted), seed=self.seed,
             )  # fmt: skip
             refined = refine_systems(tried, fitted, progress, n_reweights=measure.n_reweights)
-            found.append(measure.judge(tried, refined, fitted, fold, progress))
+            found.append(measure.assess(tried, refined, fitted, fold, progress))
         for k, figures in zip(some, measure.figures(found), strict=True):
             trials[k] = Trial(systems[k], *figures.tolist())
         return trials
@@ -224,7 +223,7 @@ class FreeRunScore:
         found: list[Confirmed] = []
         best = ranked[: self.n_confirmed]
         for trial in count_pieces(progress, best, "system", "refined on all data"):
-            attracting = [each for each in found if each.share]
+            attracting = [each for each in found if each.fraction]
             if attracting and trial.system.n_free > attracting[0].trial.system.n_free + DEARER:
                 break
             model = trial.system.refine_on_all(
@@ -233,8 +232,8 @@ class FreeRunScore:
             )  # fmt: skip
             own = measure.confirm(trial, model)
             resting = [each for each in found if each.rests]
-            if own.share and resting and not own.outdoes(resting[0]):
-                own = replace(own, share=0.0)  # it attracts by chance
+            if own.fraction and resting and not own.outdoes(resting[0]):
+                own = replace(own, fraction=0.0)  # it attracts by chance
             found.append(own)
             if own.is_global and not own.broken:
                 break
@@ -254,7 +253,7 @@ class CycleRuns:
     smoothed: Sequence[Float[np.ndarray, "_ n_states"]]
     cycles: Sequence[Cycle]
     bounds: FreeRunBounds
-    n_reweights = 0  # scale states by their standard deviation, as in the judging
+    n_reweights = 0  # scale states by their standard deviation, as in the assessing
 
     @cached_property
     def window(self) -> int:
@@ -267,15 +266,15 @@ class CycleRuns:
     def window_on_all(self) -> int:
         return self.window
 
-    def count(self, stretches: Sequence[Stretch]) -> int:
+    def count(self, segments: Sequence[Segment]) -> int:
         """Number of windows to refine on."""
         return self.rule.n_windows
 
     def admits(self, system: TrialSystem) -> bool:
-        """Whether it has all equations; one that lacks an equation cannot live."""
+        """Whether it has all equations; one without an equation cannot oscillate."""
         return bool(system.model.coef.any(axis=0).all())
 
-    def judge(
+    def assess(
         self,
         systems: Sequence[TrialSystem],
         refined: BatchRefinement,
@@ -284,22 +283,22 @@ class CycleRuns:
         progress: Progress,
     ) -> Float[np.ndarray, "systems 5"]:
         """The figures of a `Trial` of every system in one fold."""
-        first, judged = systems[0].model, []
+        first, assessed = systems[0].model, []
         coefs = np.stack([model.coef for model in refined.models])
         field = VectorField.of(first.library, [*first.states, *first.inputs], coefs)
         with progress.stage(None, "run", "free runs over the fold") as advance:
             for t, paths, cycle in self._run(field, fold.held):
-                judged.append(self._compare(t, paths, cycle, first.states))
+                assessed.append(self._compare(t, paths, cycle, first.states))
                 advance(len(paths))
-        worst = np.column_stack([np.max(judged, axis=0), refined.loss])
+        worst = np.column_stack([np.max(assessed, axis=0), refined.loss])
         pairs = zip(systems, refined.models, strict=True)
         worst[[bool(system.broken(model)) for system, model in pairs], 0] = MAX_ERROR
         return worst
 
     def _run(
-        self, field: VectorField, held: Sequence[Stretch]
+        self, field: VectorField, held: Sequence[Segment]
     ) -> Iterator[tuple[np.ndarray, np.ndarray, Cycle]]:
-        """Times and paths of every system over every held-out stretch, one start after another."""
+        """Times and paths of every system over every held-out segment, one start after another."""
         joined = np.concatenate(self.smoothed)
         centre, reach = joined.mean(axis=0), BLOW_UP * joined.std(axis=0)
         inputs = field.library.variables[field.n_states :]
@@ -335,8 +334,8 @@ class CycleRuns:
         cycle: Cycle,
         states: Sequence[str],
     ) -> Float[np.ndarray, "systems 4"]:
-        """The figures of a `Trial` but the loss, over one stretch, its first half left out."""
-        half, columns = len(t) // 2, columns_of(states, self.rule.judged)
+        """The figures of a `Trial` but the loss, over one segment, its first half left out."""
+        half, columns = len(t) // 2, columns_of(states, self.rule.assessed)
         densities, std = densities_of(self.runs[0], states), zero_to_one(cycle.std)
         ours = replace(cycle, mean=cycle.mean[columns], harmonics=cycle.harmonics[:, columns])
         found = np.full((len(paths), 4), [MAX_ERROR, np.inf, np.inf, np.inf])
@@ -359,24 +358,26 @@ class CycleRuns:
         pairs = zip(self.runs, self.cycles, strict=True)
         longest, cycle = max(pairs, key=lambda pair: np.ptp(pair[0].t))
         start = cycle.waveform(cycle.phase[:1])[0]
-        run = evaluate(model, longest, initial=start, bounds=self.bounds, judged=self.rule.judged)
-        share, repels = _attraction(run) if run.status is Status.SUSTAINED else (0.0, False)
-        return Confirmed(trial, model, trial.system.broken(model), share, run, repels)
+        run = evaluate(
+            model, longest, initial=start, bounds=self.bounds, assessed=self.rule.assessed
+        )
+        fraction, repels = _attraction(run) if run.status is Status.SUSTAINED else (0.0, False)
+        return Confirmed(trial, model, trial.system.broken(model), fraction, run, repels)
 
 
 def _attraction(run: Evaluation) -> tuple[float, bool]:
-    """Share of starts that reach the model's cycle, and whether departures from it grow.
+    """Fraction of starts that reach the model's cycle, and whether perturbations from it grow.
 
-    The share is zero if departures do not die out. A model with inputs is followed from its start
-    alone: its share is one.
+    The fraction is zero if perturbations do not decay. A model with inputs is followed from its
+    start alone: its fraction is one.
     """
     if run.model.inputs:
         return 1.0, False
-    if run.cycle is None or run.multiplier > PULL:
-        return 0.0, run.multiplier > PUSH
+    if run.cycle is None or run.multiplier > ATTRACTING_BELOW:
+        return 0.0, run.multiplier > REPELLING_ABOVE
     # Within forty periods: of cycles that are reached, one that is reached sooner is better.
-    share = share_reaching(run.model, run.cycle, n_starts=N_REACHING, n_periods=LEAST_WAIT)
-    return max(share, 0.5 / N_REACHING), False
+    fraction = basin_stability(run.model, run.cycle, n_starts=N_REACHING, n_periods=LEAST_WAIT)
+    return max(fraction, 0.5 / N_REACHING), False
 
 
 def find_cycles(runs: Sequence[Trajectory], states: Sequence[str]) -> list[Cycle] | str:

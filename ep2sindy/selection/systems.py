@@ -40,13 +40,13 @@ BATCH_STEPS = 6000
 SAME = 1.1
 
 # A system on an attracting cycle replaces a smaller one on a neutral cycle only if its window loss
-# is below this share of the other's: if only noise is left, extra terms attract by chance.
+# is below this fraction of the other's: if only noise is left, extra terms attract by chance.
 GAIN = 0.95
 
 # Largest ratio of the waveform errors of two systems that count as equals.
 ALIKE = 1.5
 
-# Share of starts from which a cycle counts as attracting everything around it.
+# Fraction of starts from which a cycle counts as attracting everything around it.
 GLOBAL = 0.9
 
 
@@ -122,7 +122,7 @@ class TrialSystem:
 
 @dataclass(frozen=True, eq=False)
 class Systems:
-    """Systems to be judged, and for each the candidates of the fronts that its equations are.
+    """Systems to be assessed, and for each the candidates of the fronts that its equations are.
 
     places: index of the candidate in every front. left_out: how many of how many combinations these
     are, as the end of a note; empty if they are all.
@@ -189,7 +189,7 @@ def find_broken_demands(
 
 
 @dataclass(frozen=True)
-class Stretch:
+class Segment:
     """The samples from start to stop (exclusive) of one run."""
 
     run: int
@@ -199,17 +199,17 @@ class Stretch:
 
 @dataclass(frozen=True, eq=False)
 class Fold:
-    """The held-out stretches of the runs, and the others, which are fitted."""
+    """The held-out segments of the runs, and the others, which are fitted."""
 
-    held: Sequence[Stretch]
-    fitted: Sequence[Stretch]
+    held: Sequence[Segment]
+    fitted: Sequence[Segment]
 
 
-def deal(stretches: Sequence[Stretch], n_folds: int) -> list[Fold]:
-    """Deal stretches out in turn, so that each is held out in one fold and fitted in the others."""
-    n_folds = min(n_folds, len(stretches))
+def deal(segments: Sequence[Segment], n_folds: int) -> list[Fold]:
+    """Deal segments out in turn, so that each is held out in one fold and fitted in the others."""
+    n_folds = min(n_folds, len(segments))
     return [
-        Fold(stretches[k::n_folds], [s for i, s in enumerate(stretches) if i % n_folds != k])
+        Fold(segments[k::n_folds], [s for i, s in enumerate(segments) if i % n_folds != k])
         for k in range(n_folds)
     ]
 
@@ -217,12 +217,12 @@ def deal(stretches: Sequence[Stretch], n_folds: int) -> list[Fold]:
 def folds(runs: Sequence[Trajectory], n_folds: int) -> list[Fold]:
     """Fold by whole runs if there are enough; otherwise cut every run into blocks.
 
-    Blocks on either side of a held-out one are fitted as one stretch each.
+    Blocks on either side of a held-out one are fitted as one segment each.
     Raises ValueError for runs too short to be cut.
     """
     lengths = [run.n_samples for run in runs]
     if len(runs) >= n_folds:
-        return deal([Stretch(k, 0, length) for k, length in enumerate(lengths)], n_folds)
+        return deal([Segment(k, 0, length) for k, length in enumerate(lengths)], n_folds)
     if max(lengths) < 2 * MIN_SAMPLES * n_folds:
         raise ValueError(
             f"runs must hold {2 * MIN_SAMPLES * n_folds} samples to be parted in {n_folds}, got at "
@@ -231,25 +231,25 @@ def folds(runs: Sequence[Trajectory], n_folds: int) -> list[Fold]:
     found = []
     for k in range(n_folds):
         held = [
-            Stretch(run, k * n // n_folds, (k + 1) * n // n_folds) for run, n in enumerate(lengths)
+            Segment(run, k * n // n_folds, (k + 1) * n // n_folds) for run, n in enumerate(lengths)
         ]
         sides = [(s.run, *ends) for s in held for ends in ((0, s.start), (s.stop, lengths[s.run]))]
-        fitted = [Stretch(run, a, b) for run, a, b in sides if b - a >= MIN_SAMPLES]
+        fitted = [Segment(run, a, b) for run, a, b in sides if b - a >= MIN_SAMPLES]
         found.append(Fold(held, fitted))
     return found
 
 
-def cut_stretches(
+def cut_segments(
     runs: Sequence[Trajectory],
-    stretches: Sequence[Stretch],
+    segments: Sequence[Segment],
     model: SparseModel,
     *,
     window: int,
     n_windows: int,
     seed: int = 0,
 ) -> WindowBatch:
-    """Windows of stretches of the runs, no longer than the longest stretch."""
-    pieces = [runs[part.run].window(part.start, part.stop) for part in stretches]
+    """Windows of segments of the runs, no longer than the longest segment."""
+    pieces = [runs[part.run].window(part.start, part.stop) for part in segments]
     return cut_windows(
         pieces,
         states=model.states,
@@ -261,7 +261,7 @@ def cut_stretches(
 
 
 def plan_refinement(batch: WindowBatch, library: Library) -> tuple[MultipleShooting, int]:
-    """Refinement method for systems to be judged, and how many to refine together.
+    """Refinement method for systems to be assessed, and how many to refine together.
 
     The regression's coefficients are close, so whole windows are fitted at once in few iterations.
     Systems that need more are the wrong ones.
@@ -293,10 +293,10 @@ def refine_systems(
 class Trial:
     """How a system does where it was not fitted: the worst over all folds.
 
-    error: in units of its bound; a system with one or less lives. f_error, amplitude: largest
-    relative errors of the frequency and of an amplitude; NaN if windows are judged. waveform:
-    largest error of the waveform, or the mean square error over windows left out. loss: on the
-    windows that the system was refined on, or, if windows are judged, on those left out.
+    error: in units of its bound; a system with one or less is sustained. f_error, amplitude:
+    largest relative errors of the frequency and of an amplitude; NaN if windows are assessed.
+    waveform: largest error of the waveform, or the mean square error over windows left out. loss:
+    on the windows that the system was refined on, or, if windows are assessed, on those left out.
     """
 
     system: TrialSystem
@@ -307,12 +307,12 @@ class Trial:
     loss: float = np.inf
 
     def rank(self, margin: float) -> tuple[bool, int, float]:
-        """Sorts the best of living systems first: those with room, the smallest, the closest."""
+        """Sorts the best sustained systems first: those with room, the smallest, the closest."""
         return self.error > margin, self.system.n_free, self.waveform
 
 
-def find_living(trials: Sequence[Trial]) -> list[Trial]:
-    """The systems that live in every fold.
+def find_sustained(trials: Sequence[Trial]) -> list[Trial]:
+    """The systems that are sustained in every fold.
 
     If some follow the windows to rounding, because the truth is in the library, these alone.
     """
@@ -320,10 +320,10 @@ def find_living(trials: Sequence[Trial]) -> list[Trial]:
     return [t for t in trials if t.error <= 1.0 and (t.loss < FLOOR or not exact)]
 
 
-def list_others(living: Sequence[Trial], winner: Trial) -> list[OtherSystem]:
-    """The other living systems of the winner's size, the best waveform first."""
+def list_others(sustained: Sequence[Trial], winner: Trial) -> list[OtherSystem]:
+    """The other self-sustained systems of the winner's size, the best waveform first."""
     size = winner.system.n_free
-    alike = [t for t in living if t is not winner and t.system.n_free == size]
+    alike = [t for t in sustained if t is not winner and t.system.n_free == size]
     return [
         OtherSystem(t.system.parts, t.error, t.f_error, t.amplitude, t.waveform)
         for t in sorted(alike, key=lambda t: t.waveform)
@@ -345,28 +345,28 @@ def order_equals(ranked: Sequence[Trial]) -> list[Trial]:
 class Confirmed:
     """A system refined on all data, and its free run over the longest record.
 
-    broken: demands that the coefficients do not meet. share: of starts around the cycle that reach
-    it; zero if the model does not live, or if departures from its cycle do not die out. run: None
-    if windows are judged; share is then one, or zero if demands are broken. repels: True if
-    departures grow.
+    broken: demands that the coefficients do not meet. fraction: of starts around the cycle that
+    reach it; zero if the model does not sustain its oscillation, or if perturbations from its cycle
+    do not decay. run: None if windows are assessed; fraction is then one, or zero if demands are
+    broken. repels: True if perturbations grow.
     """
 
     trial: Trial
     model: SparseModel
     broken: Sequence[str]
-    share: float
+    fraction: float
     run: Evaluation | None = None
     repels: bool = False
 
     @property
     def is_global(self) -> bool:
-        return self.share >= GLOBAL
+        return self.fraction >= GLOBAL
 
     @property
     def rests(self) -> bool:
-        """Whether it lives on a neutral cycle."""
-        lives = self.run is not None and self.run.status is Status.SUSTAINED
-        return lives and not self.share and not self.repels
+        """Whether it is sustained on a neutral cycle."""
+        is_sustained = self.run is not None and self.run.status is Status.SUSTAINED
+        return is_sustained and not self.fraction and not self.repels
 
     def outdoes(self, resting: Confirmed) -> bool:
         """Whether an attracting system is preferred to one that is no larger, on a neutral cycle.
@@ -383,20 +383,23 @@ class Confirmed:
     def rank(self) -> tuple[float, ...]:
         """Sorts the best first; the first of equals wins."""
         goes = (False, 0) if self.run is None else self.run.rank
-        size, share = self.trial.system.n_free, min(self.share, GLOBAL)
-        attracts = (self.repels, not self.share, not self.is_global)
-        return (bool(self.broken), *goes, *attracts, size, -share)
+        size, fraction = self.trial.system.n_free, min(self.fraction, GLOBAL)
+        attracts = (self.repels, not self.fraction, not self.is_global)
+        return (bool(self.broken), *goes, *attracts, size, -fraction)
 
-    def text(self, n_living: int, n_systems: int) -> str:
+    def text(self, n_sustained: int, n_systems: int) -> str:
         """How the system was confirmed, in words."""
         if self.run is None:
             found = "chosen by windows held out"
         else:
-            how = self.run.text if n_living else f"{self.run.text} where fitted"
-            if self.run.status is Status.SUSTAINED and not self.share:
+            how = self.run.text if n_sustained else f"{self.run.text} where fitted"
+            if self.run.status is Status.SUSTAINED and not self.fraction:
                 how = f"{how}, on a cycle that {'repels' if self.repels else 'does not attract'}"
-            elif self.share and not self.model.inputs:
-                how = f"{how}, {100.0 * self.share:.0f} % of starts reach it"
-            found = f"{how}; {n_living or 'none'} of {n_systems} systems live where not fitted"
+            elif self.fraction and not self.model.inputs:
+                how = f"{how}, {100.0 * self.fraction:.0f} % of starts reach it"
+            found = (
+                f"{how}; {n_sustained or 'none'} of {n_systems} systems are sustained "
+                "where not fitted"
+            )
         demands = f"; no system meets all demands: {', '.join(self.broken)}" if self.broken else ""
         return found + demands

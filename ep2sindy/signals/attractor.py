@@ -20,13 +20,14 @@ from ep2sindy.signals.spectrum import (
 
 MIN_PERIODS = 3.0  # fewest periods in a record that counts as repeating
 
-# Least share of the variance of some state, noise included, that the waveform must explain:
+# Least fraction of the variance of some state, noise included, that the waveform must explain:
 # noise alone has spectral lines, too.
 MIN_VISIBLE = 0.1
 
-MIN_SHARE = 0.5  # least share of the variance that the waveform explains if there is a period
+MIN_FRACTION = 0.5  # least fraction of the variance that the waveform explains if there is a period
 
-# Least share from which a record repeats itself: that of chaos is 0.5 to 0.75, of some nearly this.
+# Least fraction from which a record repeats itself: that of chaos is 0.5 to 0.75, of some nearly
+# this.
 REPEATS = 0.9
 
 MAX_HARMONICS = 16
@@ -50,7 +51,7 @@ class Cycle:
 
     phase: (samples,) in rad, phase of the fundamental, followed along the record.
     mean: (n_states,). harmonics: (n_harmonics, n_states), in the states' units.
-    share: fraction of the pooled variance of the states, without white noise, that the waveform
+    fraction: fraction of the pooled variance of the states, without white noise, that the waveform
     explains.
     """
 
@@ -58,7 +59,7 @@ class Cycle:
     phase: Float[np.ndarray, " samples"]
     mean: Float[np.ndarray, " n_states"]
     harmonics: Complex[np.ndarray, "n_harmonics n_states"]
-    share: float
+    fraction: float
 
     @property
     def std(self) -> Float[np.ndarray, " n_states"]:
@@ -72,7 +73,7 @@ class Cycle:
     @property
     def repeats(self) -> bool:
         """Whether the waveform is all there is; otherwise it is what chaos has on average."""
-        return self.share >= REPEATS
+        return self.fraction >= REPEATS
 
     def waveform(self, phase: Float[np.ndarray, " points"]) -> Float[np.ndarray, "points n_states"]:
         """States of the periodic waveform at the given phases, in rad."""
@@ -117,15 +118,15 @@ def find_cycle(
         return None
     noise = len(t) * np.array([white_variance(*spectrum) for spectrum in spectra])
     known = np.maximum(whole - noise, 1e-12)
-    share = 1.0 - float(np.maximum(rest - noise, 0.0).sum() / known.sum())
-    if not (share >= MIN_SHARE and frequency_Hz > 0.0):
+    fraction = 1.0 - float(np.maximum(rest - noise, 0.0).sum() / known.sum())
+    if not (fraction >= MIN_FRACTION and frequency_Hz > 0.0):
         return None
     return Cycle(
         frequency_Hz=frequency_Hz,
         phase=read_only(phase),
         mean=read_only(states.mean(axis=0) + series[0] * spread),
         harmonics=(series[1::2] - 1j * series[2::2]) * spread,
-        share=share,
+        fraction=fraction,
     )
 
 
@@ -149,12 +150,12 @@ def _estimate_phase(
     varying = scaled[:, scaled.any(axis=0)]
     left = [_fit_series(each, varying, most, chosen=False)[1] for each in tried]
     straight, wandering = (len(t) * np.log(squares).sum() for squares in left)
-    price = np.log(len(t)) * n_periods / (0.5 * PERIODS_TRACKED)
-    return tried[1] if straight - wandering > price else tried[0]
+    penalty = np.log(len(t)) * n_periods / (0.5 * PERIODS_TRACKED)
+    return tried[1] if straight - wandering > penalty else tried[0]
 
 
 def _find_line(frequency: np.ndarray, power: np.ndarray) -> tuple[float, float]:
-    """Dominant frequency in Hz of a spectrum, and the share of the power within two bins of it."""
+    """Dominant frequency in Hz of a spectrum, and the fraction of power within two bins."""
     rough_Hz = peak(frequency, power)
     if rough_Hz <= 0.0:
         return 0.0, 0.0
@@ -314,8 +315,8 @@ def _fit_series(
     left = np.maximum(whole - np.cumsum(np.square(known), axis=0)[::2], 1e-12 * whole)
     order = most
     if chosen:
-        price = np.log(len(phase)) * (1 + 2 * np.arange(most + 1)) * scaled.shape[1]
-        order = max(1, int(np.argmin(len(phase) * np.log(left).sum(axis=1) + price)))
+        penalty = np.log(len(phase)) * (1 + 2 * np.arange(most + 1)) * scaled.shape[1]
+        order = max(1, int(np.argmin(len(phase) * np.log(left).sum(axis=1) + penalty)))
     kept = slice(0, 1 + 2 * order)
     return np.linalg.solve(triangle[kept, kept], known[kept]), left[order]
 

@@ -25,8 +25,8 @@ FIRST_LOOK = 50_000
 # Samples of all records together from which a search by `discover` takes minutes.
 LONG = 20_000
 
-# Largest share of the power above the noise that means may take from a variable of a long record.
-# At a hundred samples to a period they take 3e-8 of a sine, and 2e-6 of its third harmonic.
+# Largest fraction of the power above the noise that means may take from a variable of a long
+# record. At a hundred samples to a period they take 3e-8 of a sine, and 2e-6 of its third harmonic.
 LOST = 1e-6
 
 
@@ -38,7 +38,7 @@ def average_alike(
     decimate: number of samples that a mean is over; "auto" leaves a hundred to a period of the
     fastest state, None leaves all. States and inputs are averaged alike: the mean of a state
     follows the mean of what drives it. No mean crosses a gap, and an incomplete group at the end of
-    a stretch is dropped. Runs with missing samples stay as they are, since those of a slower
+    a segment is dropped. Runs with missing samples stay as they are, since those of a slower
     channel would be averaged over other times.
     Raises ValueError for another `decimate`.
     """
@@ -94,7 +94,7 @@ def _samples_in_period(t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " 
 
 
 def _lost(run: Trajectory, factor: int) -> float:
-    """Largest share of a state's power that means over so many samples take from it."""
+    """Largest fraction of a state's power that means over so many samples take from it."""
     return max(lost_in_means(run.t, x, width_s=factor * run.dt_s) for x in run.states.T)
 
 
@@ -107,7 +107,7 @@ def _in_means(runs: Sequence[Trajectory], factor: int) -> tuple[list[Trajectory]
 
 
 def _means(run: Trajectory, factor: int) -> Trajectory:
-    """Means over `factor` consecutive samples of every stretch between gaps."""
+    """Means over `factor` consecutive samples of every segment between gaps."""
 
     def mean(values: np.ndarray) -> np.ndarray:
         parts = []

@@ -25,7 +25,7 @@ class Delay:
     stage is the state of some time ago, averaged over a gamma distribution of mean `delay_s` and
     standard deviation delay_s / sqrt(n_stages): the more stages, the sharper the delay. Since the
     stages are states, with equations that are known, a model with delayed terms is refined,
-    integrated and judged like any other; its start says what the stages hold.
+    integrated and assessed like any other; its start says what the stages hold.
     Raises ValueError for a delay that is not positive, or no stage.
     Source of the "linear chain trick": MacDonald 1978, Time Lags in Biological Models,
     doi:10.1007/978-3-642-93107-9.

@@ -2,7 +2,7 @@
 
 A record of a driven signal alone looks like that of a self-sustained oscillation, and equations are
 found for either. Three signs tell them apart: a column beside it that looks set, a frequency that
-somebody chose, and a phase that is pushed from period to period and returns, as to a clock.
+somebody chose, and a phase that moves from period to period and returns, as to a clock.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from ep2sindy.library.library import Library
 from ep2sindy.library.units import Clock, seconds_in
 from ep2sindy.runtime.values import check_positive
 from ep2sindy.signals.attractor import Cycle, find_cycle
-from ep2sindy.signals.trace import Trace
+from ep2sindy.signals.signal import Signal
 
 DRIVE = ("cos_drive", "sin_drive")  # inputs that stand for a drive of known period
 
@@ -29,25 +29,32 @@ BY_CHANCE = 0.01  # most probability that a frequency which nobody chose is roun
 CLOCK = 2e-5  # relative error of a quartz clock, in the record's times or in the drive's
 N_ERRORS = 2.0  # standard errors of a frequency within which it counts as another
 # A grid wanders by 1e-3. Larger errors than three times that would meet one frequency in a hundred.
-MAINS_Hz, MAINS_ERROR, MAINS_TOLD = (50.0, 60.0, 100.0, 120.0), 1e-3, 3e-3
+MAINS_Hz, MAINS_ERROR, MAINS_STATED = (50.0, 60.0, 100.0, 120.0), 1e-3, 3e-3
 # A year has 365 to 365.25 days. Two decades hold three periods: an error of 0.02 is rarely met.
-CALENDAR, CALENDAR_ERROR, CALENDAR_TOLD = ("day", "year"), 1e-3, 0.02
+CALENDAR, CALENDAR_ERROR, CALENDAR_STATED = ("day", "year"), 1e-3, 0.02
 
-MIN_TOLD = 20  # fewest periods in which a phase that returns is told from one that walks
+MIN_PERIODS_OF_PHASE = (
+    20  # fewest periods in which a phase that returns is stated from one that walks
+)
 # Mean square of a random walk of n unit steps about its best line, over n: one in a hundred walks
 # of twenty steps is below this, and fewer of longer ones (simulated).
 LEAST_WALK = 0.0147
-PUSHED = 4.0  # least square of a phase's moves over that of noise, of twenty moves: five errors
+LEAST_MOVES = (
+    4.0  # least square of a phase's moves over that of noise, of twenty moves: five errors
+)
 MISSED = 1.64  # of white noise: its variance, and that between the other samples, of 0.64
 N_POINTS = 64  # in a period, between samples by cubic splines
 SETTLED = 3  # a phase is looked at after the first of so many parts of a record, a transient
 
 HELD, SWEPT, SINE = "held between steps", "a triangle or a sweep", "a sine"
-RESTING = 0.5  # least share of steps in which a held column rests
-LEAP = 0.1  # least median move of a held column, as a share of its range: no coarse scale
+RESTING = 0.5  # least fraction of steps in which a held column rests
+LEAP = 0.1  # least median move of a held column, as a fraction of its range: no coarse scale
 EVEN = 0.05  # most distance of a sweep's values from an even spread; a sine's is 0.1
-PURE, PURER = 2.5e-3, 20.0  # most share that is no sine in one, and least ratio to the others'
-FORETOLD = 0.1  # least share of the error of a forecast that a drive takes away
+PURE, PURER = (
+    2.5e-3,
+    20.0,
+)  # largest fraction that is no sine in one, and least ratio to the others'
+FORETOLD = 0.1  # least fraction of the error of a forecast that a drive takes away
 N_AHEAD, N_LAGS = 12, 3  # steps in a period, and how many of them, by which a signal is foretold
 
 
@@ -132,30 +139,32 @@ class PhaseRecord:
         return float(np.sqrt(12.0 * squares / n**3 + 18.0 * lasts / n**2)) / (2.0 * np.pi)
 
     @property
-    def is_pushed(self) -> bool:
+    def has_moving_phase(self) -> bool:
         """Whether the phase moves from period to period by more than noise explains."""
-        return len(self.phase) >= MIN_TOLD and self.moved > 2.0 * PUSHED * self.noise
+        return (
+            len(self.phase) >= MIN_PERIODS_OF_PHASE and self.moved > 2.0 * LEAST_MOVES * self.noise
+        )
 
     @property
     def returns(self) -> bool:
-        """Whether the phase is pushed and returns, as to a clock.
+        """Whether the phase is moved and returns, as to a clock.
 
-        Nothing brings back the phase of a self-sustained oscillation that is pushed: it walks, and
-        its squares about the best line grow with the record. They lie below the bound in one of a
-        hundred such records, at most.
+        Nothing brings back the phase of a self-sustained oscillation under random perturbations: it
+        walks, and its squares about the best line grow with the record. They lie below the bound in
+        one of a hundred such records, at most.
         """
         steps = self.moved - 2.0 * self.noise
         least = LEAST_WALK * len(self.phase) * steps
-        return self.is_pushed and bool(np.square(self.phase).mean() < least)
+        return self.has_moving_phase and bool(np.square(self.phase).mean() < least)
 
 
 def ask_whether_driven(
-    signal: Trace, beside: Mapping[str, tuple[np.ndarray, np.ndarray]]
+    signal: Signal, beside: Mapping[str, tuple[np.ndarray, np.ndarray]]
 ) -> str | None:
     """The question, in one sentence, for a signal without inputs that looks driven; else None.
 
     beside: other columns of its file, name -> (times in s, samples). Of self-sustained oscillations
-    that are pushed at random, one in a hundred has a phase that returns, at most, and two have a
+    that are moved at random, one in a hundred has a phase that returns, at most, and two have a
     round frequency.
     """
     if signal.run.input_names:
@@ -179,11 +188,11 @@ def ask_whether_driven(
     )
 
 
-def say_what_is_not_told(signal: Trace) -> str | None:
+def report_unknown_drive(signal: Signal) -> str | None:
     """A remark if the record shows neither a phase that walks nor one that returns; else None."""
     if signal.cycle is None or signal.run.input_names:
         return None
-    if PhaseRecord.of(signal.t, signal.x, signal.cycle).is_pushed:
+    if PhaseRecord.of(signal.t, signal.x, signal.cycle).has_moving_phase:
         return None
     return (
         f"this record does not tell whether {signal.name} sustains itself or is driven: its phase "
@@ -191,7 +200,7 @@ def say_what_is_not_told(signal: Trace) -> str | None:
     )
 
 
-def _looks_driven(signal: Trace) -> tuple[str, float] | None:
+def _looks_driven(signal: Signal) -> tuple[str, float] | None:
     """Why a signal by itself looks driven, and the period in s; None if it does not."""
     if signal.cycle is None:
         return None
@@ -203,7 +212,7 @@ def _looks_driven(signal: Trace) -> tuple[str, float] | None:
     if not (repeats and record.returns):
         return None
     return (
-        f"its phase is pushed by {np.sqrt(record.moved):.2g} rad from period to period, and "
+        f"its phase moves by {np.sqrt(record.moved):.2g} rad from period to period, and "
         f"returns over {len(record.phase)} periods, as to a clock"
     ), 1.0 / record.frequency_Hz
 
@@ -211,10 +220,10 @@ def _looks_driven(signal: Trace) -> tuple[str, float] | None:
 def _round_number(f_Hz: float, error: float, clock: Clock) -> tuple[str, float] | None:
     """The round frequency that one of this relative error is, in words and Hz; None for none."""
     known = [(f"one per {unit}", 1.0 / seconds_in(unit)) for unit in CALENDAR]
-    limits = [(CALENDAR_ERROR, CALENDAR_TOLD)] * len(known)
+    limits = [(CALENDAR_ERROR, CALENDAR_STATED)] * len(known)
     if clock.unit == "s":
         known += [(f"{own_Hz:g} Hz, as of the mains,", own_Hz) for own_Hz in MAINS_Hz]
-        limits += [(MAINS_ERROR, MAINS_TOLD)] * len(MAINS_Hz)
+        limits += [(MAINS_ERROR, MAINS_STATED)] * len(MAINS_Hz)
     for (words, own_Hz), (least, most) in zip(known, limits, strict=True):
         if abs(f_Hz / own_Hz - 1.0) < error + least < most:
             return words, own_Hz
@@ -227,8 +236,8 @@ def _round_number(f_Hz: float, error: float, clock: Clock) -> tuple[str, float] 
     return None
 
 
-def _gain(signal: Trace, t: np.ndarray, u: np.ndarray) -> float:
-    """Share of the squared error of a signal's linear forecasts that a column takes away.
+def _gain(signal: Signal, t: np.ndarray, u: np.ndarray) -> float:
+    """Fraction of the squared error of a signal's linear forecasts that a column takes away.
 
     It enters with its square, for a signal that does not mind its sign.
     """
@@ -267,8 +276,8 @@ def describe_set(
         return HELD if np.median(moves[moves > 0.0]) >= LEAP * np.ptp(u) else ""
     if (cycle := find_cycle(t, u[:, None])) is None:
         return ""
-    share = np.linspace(0.0, 1.0, len(u))
-    if np.abs((np.sort(u) - u.min()) / np.ptp(u) - share).max() < EVEN:
+    fraction = np.linspace(0.0, 1.0, len(u))
+    if np.abs((np.sort(u) - u.min()) / np.ptp(u) - fraction).max() < EVEN:
         return SWEPT
     wave = np.column_stack([np.ones(len(t)), np.cos(cycle.phase), np.sin(cycle.phase)])
     columns = np.column_stack([u, *others])

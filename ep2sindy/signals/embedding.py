@@ -18,15 +18,15 @@ from ep2sindy.library.units import unit_product
 from ep2sindy.runtime.values import check_count
 from ep2sindy.signals.driving import drop_repeats
 from ep2sindy.signals.log_smoother import LogSmoother
+from ep2sindy.signals.signal import Signal, prepare_signal
 from ep2sindy.signals.smoothers import KalmanSmoother
 from ep2sindy.signals.spectrum import signal_memory_s
-from ep2sindy.signals.trace import Trace, prepare_signal
 
 # Number of harmonics that the smoothers follow; faster components count as noise. Two states
 # cannot describe more. Ion-transit oscillations, ten times faster, would spoil the derivative.
 HARMONICS = 7.0
 
-# Least share of what stands out of the noise floor in the spectrum that a smoother must follow.
+# Least fraction of what stands out of the noise floor in the spectrum that a smoother must follow.
 KEPT = 0.99
 
 MAX_STATES = 5
@@ -34,7 +34,7 @@ MAX_STATES = 5
 # Neighbours whose mean predicts the next state, samples at either end and most samples used.
 N_NEIGHBOURS, EDGE, MAX_POINTS = 4, 10, 5000
 
-DELAY = 0.25  # of a delayed value, as a share of the period
+DELAY = 0.25  # of a delayed value, as a fraction of the period
 
 CUBIC = 3  # degree of a spline, which needs more samples than that
 
@@ -89,7 +89,7 @@ class Embedding:
         more = f", with {n - 1} more derivative{'s'[: n - 2]}" if n > 1 else ""
         return SAYS[self.how].format(n=n, more=more, times=f", {n} times" if n > 1 else "")
 
-    def names(self, signal: Trace) -> tuple[str, ...]:
+    def names(self, signal: Signal) -> tuple[str, ...]:
         """The states. Of hidden ones too, the first is a growth rate if the signal is positive."""
         x, n = signal.name, self.n_states
         if self.how == "delays":
@@ -98,7 +98,7 @@ class Embedding:
         letters = ("ghkl" if is_rate else "vwuz")[: n - 1]
         return x, *(name if name != x else f"{name}_rate" for name in letters)
 
-    def embed(self, signal: Trace, reason: str = "set") -> Embedded:
+    def embed(self, signal: Signal, reason: str = "set") -> Embedded:
         """The states of a signal. Raises ValueError for a growth rate of one that is not positive.
 
         reason: why they are made so, in words.
@@ -124,7 +124,7 @@ class Embedding:
         )
         return Embedded(self, signal, run, names, known, noise_std, reason)
 
-    def _states(self, signal: Trace) -> tuple[np.ndarray, list[np.ndarray], float]:
+    def _states(self, signal: Signal) -> tuple[np.ndarray, list[np.ndarray], float]:
         """Times, every state at these, and the standard deviation of the noise in the signal."""
         t, n = signal.t, self.n_states
         if self.how == "hidden":
@@ -160,7 +160,7 @@ class Embedded:
     """
 
     embedding: Embedding
-    signal: Trace
+    signal: Signal
     run: Trajectory
     names: Sequence[str]
     known: Mapping[str, str]
@@ -205,7 +205,7 @@ class Embedded:
 
 
 def embed(
-    run: Run | Trace,
+    run: Run | Signal,
     how: str = "auto",
     signal: str | None = None,
     *,
@@ -233,13 +233,13 @@ def embed(
     >>> round(found.model.terms("v")["x"], 2)
     -1.0
     """
-    if not isinstance(run, Trace):
+    if not isinstance(run, Signal):
         run = prepare_signal(run, signal, decimate=decimate, detrend=detrend)
     return embed_alike([run], how, n_states=n_states, harmonics=harmonics)[0]
 
 
 def embed_alike(
-    signals: Sequence[Trace], how: str = "auto", *, n_states: int = 2, harmonics: float = HARMONICS
+    signals: Sequence[Signal], how: str = "auto", *, n_states: int = 2, harmonics: float = HARMONICS
 ) -> list[Embedded]:
     """Make states of the same signal of several runs, by one embedding.
 
@@ -262,25 +262,26 @@ def embed_alike(
         return make("rate", f"{name} is positive")
     either = f"{name} takes either sign"
     found = make("derivative", either)
-    share = max(each.noise_std / float(each.signal.x.std()) for each in found)
-    if share <= DROWNED:
+    fraction = max(each.noise_std / float(each.signal.x.std()) for each in found)
+    if fraction <= DROWNED:
         return found
-    return make("delays", f"{either}, and noise is {share:.2f} of its standard deviation")
+    return make("delays", f"{either}, and noise is {fraction:.2f} of its standard deviation")
 
 
-def _check_positive(signal: Trace) -> None:
+def _check_positive(signal: Signal) -> None:
     if signal.is_positive:
         return
-    share = 100.0 * float((signal.x <= 0.0).mean())
+    fraction = 100.0 * float((signal.x <= 0.0).mean())
     raise ValueError(
         f"a growth rate needs a positive signal: {signal.name} falls to {signal.x.min():.4g} "
-        f"{signal.unit}, {share:.2g} % of its samples are zero or less, and noise does not explain "
+        f"{signal.unit}, {fraction:.2g} % of its samples are zero or less, and noise does not "
+        "explain "
         "it; take its derivative instead (derivative), or an offset out of it"
     )
 
 
 def _append_past(t: np.ndarray, x: np.ndarray, lags_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Times of a stretch without a gap, and its states there: x, and x some lags before."""
+    """Times of a segment without a gap, and its states there: x, and x some lags before."""
     late = t >= t[0] + lags_s[-1]
     past = make_interp_spline(t, x, k=CUBIC)
     return t[late], np.column_stack([x[late], *(past(t[late] - lag_s) for lag_s in lags_s)])
@@ -293,7 +294,7 @@ def _differentiate(t: np.ndarray, x: np.ndarray, n: int) -> list[np.ndarray]:
 
 
 def unexplained(states: Embedded) -> float:
-    """Share of the next state's variance that neighbours in the given states do not explain.
+    """Fraction of the next state's variance that neighbours in the given states do not explain.
 
     The next state, such as a further derivative, is a function of the given ones and of the inputs
     if these are enough; then neighbours agree in it. Otherwise some neighbours are false ones,

@@ -128,12 +128,12 @@ def _find_likeliest_mode(
     for decade in decades:
         modes.append(_find_mode(y, process, decade, log))
         log = modes[-1][1]
-    misfits = np.array([misfit for misfit, *_ in modes])
-    start = modes[int(misfits.argmin())][1]
+    costs = np.array([cost for cost, *_ in modes])
+    start = modes[int(costs.argmin())][1]
     ratio = least_beside_grid(
         lambda ratio: _find_mode(y, process, ratio, start)[0],
         decades,
-        misfits,
+        costs,
         tolerance=LOG10_RATIO_TOLERANCE,
     )
     return ratio, _find_mode(y, process, ratio, start)
@@ -148,12 +148,12 @@ def _find_mode(y: np.ndarray, process: WienerProcess, log10_ratio: float, log: n
         value = np.exp(log)
         pull = value * (y - value)
         step = -process.solve(log[:, None], ratio, weights=value**2, pull=pull[:, None])[0][:, 0]
-        share = min(1.0, 2.0 / max(np.abs(step).max(), 1e-300))
-        while (tried := squares_at(log + share * step)) > squares and share > 1e-6:
-            share *= 0.5
+        fraction = min(1.0, 2.0 / max(np.abs(step).max(), 1e-300))
+        while (tried := squares_at(log + fraction * step)) > squares and fraction > 1e-6:
+            fraction *= 0.5
         if tried > squares:
             break
-        log, gained, squares = log + share * step, squares - tried, tried
+        log, gained, squares = log + fraction * step, squares - tried, tried
         if gained <= TOLERANCE * squares:
             break
     _, _, logs = process.solve(log[:, None], ratio, weights=np.exp(2.0 * log))

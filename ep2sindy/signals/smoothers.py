@@ -34,7 +34,7 @@ MIN_SAMPLES = 5
 # Variance of the rounding errors of values scaled to unit range; less noise cannot be detected.
 ROUNDING = np.finfo(np.float64).eps ** 2
 
-# Steps shorter than this share of a unit count as that long; divided differences of samples that
+# Steps shorter than this fraction of a unit count as that long; divided differences of samples that
 # are closer together lose their digits.
 CLOSEST = 1e-6
 
@@ -406,14 +406,14 @@ def most_likely_ratios(
     if not columns.shape[1]:
         return np.empty(0)  # LAPACK takes no empty right-hand sides
 
-    def misfit(j: int, log10_ratio: float) -> float:
+    def cost(j: int, log10_ratio: float) -> float:
         return -float(process.likelihood(columns[:, [j]], 10.0**log10_ratio)[0][0])
 
     decades = np.append(np.arange(lowest, highest, 1.0), highest)
     # One factorisation of a decade serves all columns.
     on_grid = np.array([-process.likelihood(columns, 10.0**decade)[0] for decade in decades])
     beside = partial(least_beside_grid, tolerance=LOG10_RATIO_TOLERANCE)
-    return np.array([beside(partial(misfit, j), decades, own) for j, own in enumerate(on_grid.T)])
+    return np.array([beside(partial(cost, j), decades, own) for j, own in enumerate(on_grid.T)])
 
 
 def check_memory_bounds(finest_s: float | None, coarsest_s: float | None) -> None:
@@ -432,7 +432,8 @@ def scale_steps(
     """
     if len(t) < least or len(values) != len(t):
         raise ValueError(
-            f"smoothing needs at least {least} samples, one row of values per time, got {len(values)} "
+            f"smoothing needs at least {least} samples, one row of values per time, got "
+            f"{len(values)} "
             f"rows with {len(t)} times; join more data"
         )
     check_time(t)
@@ -460,13 +461,13 @@ def _covariance(steps: Float[np.ndarray, " steps"]) -> Float[np.ndarray, "four d
     A difference is the mean of the third derivative under a quadratic B-spline over its three
     steps. Products of two are of degree four, so three Gauss nodes a step integrate them.
     """
-    nodes, shares = np.polynomial.legendre.leggauss(3)
+    nodes, fractions = np.polynomial.legendre.leggauss(3)
     x, y = 0.5 * (1.0 + nodes), 0.5 * (1.0 - nodes)
     one, two, three = steps[:-2, None], steps[1:-1, None], steps[2:, None]
     before, after, whole = one + two, two + three, one + two + three
     middle = (one + two * x) * y / before + (three + two * y) * x / after
     splines = np.stack([one * x**2 / before, middle, three * y**2 / after]) * 3.0 / whole
-    weights = 0.5 * shares * np.stack([one, two, three])
+    weights = 0.5 * fractions * np.stack([one, two, three])
     covariance = np.zeros((4, len(one)), order="F")  # as LAPACK takes it
     for k in range(min(3, len(one))):  # difference i + k begins where step k of i does
         n = len(one) - k

@@ -20,9 +20,9 @@ from ep2sindy.data.numbers import rounding_s, zero_to_one
 
 STEP_TOLERANCE = 1e-6  # largest relative spread of steps in uniform sampling
 
-PEAK_WIDTH = 0.05  # half-width of a peak, as a share of its frequency; two bins at least
+PEAK_WIDTH = 0.05  # half-width of a peak, as a fraction of its frequency; two bins at least
 
-DIED_OUT = 0.1  # a run has died out if its late spread is below this share of the data's
+DECAYED = 0.1  # a run has decayed if its late spread is below this fraction of the data's
 
 
 def is_uniform(t: Float[np.ndarray, " samples"]) -> bool:
@@ -139,7 +139,7 @@ def crossing_frequency(t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " 
 def lost_in_means(
     t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samples"], *, width_s: float
 ) -> float:
-    """Share of a signal's power above the noise that means over a width in s take from it."""
+    """Fraction of a signal's power above the noise that means over a width in s take from it."""
     frequency, power = power_spectrum(t, x)
     excess = _above_noise(power)
     taken = np.square(1.0 - np.sinc(frequency * width_s))
@@ -152,9 +152,9 @@ def signal_memory_s(
 ) -> float:
     """Longest memory, in s, of a twice integrated Wiener process that still follows the signal.
 
-    A smoother of memory tau passes the share 1 / (1 + (2 pi f tau)^6) of a component of frequency
-    f. What it changes may hold no more than 1 - kept of the power that stands out of the noise
-    floor.
+    A smoother of memory tau passes the fraction 1 / (1 + (2 pi f tau)^6) of a component of
+    frequency f. What it changes may hold no more than 1 - kept of the power that stands out of the
+    noise floor.
     """
     frequency, power = power_spectrum(t, x)
     excess = _above_noise(power)[1:]
@@ -200,7 +200,7 @@ class OscillationBounds:
     The record is cut into `n_blocks` of time, and the last one is tested. spread: least standard
     deviation of every state, in units of its mean. lasting: least ratio of the last block's
     standard deviation to the first block's. min_periods: least number of periods in the whole
-    record. min_peak: least share of the first state's power at its dominant frequency. max_Hz:
+    record. min_peak: least fraction of the first state's power at its dominant frequency. max_Hz:
     highest dominant frequency.
     """
 
@@ -252,10 +252,10 @@ def relative_spread(
 def has_decayed(
     states: Float[np.ndarray, "samples n_states"],
     earlier: Float[np.ndarray, "_ n_states"],
-    share: float,
+    fraction: float,
 ) -> Bool[np.ndarray, " n_states"]:
-    """True for each state whose standard deviation is below `share` times that of `earlier`."""
-    below: np.ndarray = states.std(axis=0) < share * earlier.std(axis=0)
+    """True for each state whose standard deviation is below `fraction` times that of `earlier`."""
+    below: np.ndarray = states.std(axis=0) < fraction * earlier.std(axis=0)
     return below
 
 

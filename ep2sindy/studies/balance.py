@@ -1,4 +1,4 @@
-"""The balance of a zone beside a living model: processes compared, and terms left out in turn."""
+"""The balance of a zone next to a model: processes compared, and terms left out in turn."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.figures.living import balance_figure
+from ep2sindy.figures.free_run import balance_figure
 from ep2sindy.forecasting.evaluation import Evaluation, evaluate
 from ep2sindy.library.relations import Constraint, constraint
 from ep2sindy.library.roles import constraint_of
@@ -19,7 +19,6 @@ from ep2sindy.model.stability import LimitCycle
 from ep2sindy.report.report import Report
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View
 from ep2sindy.runtime.progress import SILENT, Progress, count_pieces
-from ep2sindy.studies.living import start_of, two_periods
 from ep2sindy.studies.processes import (
     IONS,
     NEUTRALS,
@@ -28,6 +27,7 @@ from ep2sindy.studies.processes import (
     compared_processes,
     ends_of,
 )
+from ep2sindy.studies.sustained import start_of, two_periods
 from ep2sindy.studies.views import largest
 
 CAPTION = (
@@ -113,7 +113,7 @@ TERMS: Metrics[TermRole] = [
 
 @dataclass(frozen=True, eq=False)
 class ModelBalance:
-    """A living model beside the balance of its zone.
+    """A self-sustained model beside the balance of its zone.
 
     processes: none if the model was not found under roles of n_i and n_n. terms: each left out in
     turn.
@@ -241,7 +241,7 @@ def _each_left_out(
     for process in held_to.processes:
         others = [each for each in held_to.processes if each is not process]
         less = constraint_of(model.library, model.states, others, held_to.known)
-        assert less is not None, "fewer processes are told apart as well"
+        assert less is not None, "fewer processes are distinguished as well"
         found.append(less)
     return found
 

@@ -50,7 +50,7 @@ EXAMPLES = (
 )
 INTRODUCTION = (
     "Each realization draws an initial state, or for the Van der Pol oscillator its parameter, at "
-    "random; white noise of the given share of each state's RMS is added; the library holds all "
+    "random; white noise of the given fraction of each state's RMS is added; the library holds all "
     "products of the states up to a degree. A realization counts only if the equations of all "
     "states are right at once. Every variant sees the same realizations. Italic rows: the "
     "thesis's own numbers, for 100 realizations. CPU: time of one search (all equations of one "
@@ -155,7 +155,7 @@ class Study:
             return
         variant, method = methods.popitem()
         pairs = [*product(self.systems, sorted(self.noises))]
-        seed = [report.seed, 0, *variant.encode()]  # as in `judged`
+        seed = [report.seed, 0, *variant.encode()]  # as in `assessed`
         draw = self._draw(report.seed)
         found = first_realizations(method, pairs, draw, seed=seed, progress=report.watch)
         report.section(f"Identified by {variant}")
@@ -175,8 +175,8 @@ class Study:
         """
         check_systems(self.systems)
         tasks = list(product(self.systems, sorted(self.noises), range(self.n_realizations)))
-        judge = partial(judged, variants, self._draw(seed), seed=seed)
-        rows = rows_in_order(self.parallel, judge, tasks, "realization", progress)
+        assess = partial(assessed, variants, self._draw(seed), seed=seed)
+        rows = rows_in_order(self.parallel, assess, tasks, "realization", progress)
         return pd.DataFrame(rows)
 
     def _draw(self, seed: int) -> Draw:
@@ -184,7 +184,7 @@ class Study:
         return partial(realization, n_trajectories=count, degree=self.degree, seed=seed)
 
 
-def judged(
+def assessed(
     variants: Mapping[str, Variant], draw: Draw, task: tuple[str, float, int], *, seed: int
 ) -> list[dict[str, object]]:
     """Rows of `Study.outcomes` of one realization: a system, a noise, and its number."""
@@ -288,11 +288,11 @@ def best_variant(cells: pd.DataFrame) -> Result:
     counts = cells.dropna(subset=[merit]).groupby("variant", sort=False)[[merit, "n"]].sum()
     percent = 100 * counts[merit] / counts["n"]
     best = str(percent.idxmax())
-    shares = "; ".join(f"{name} {value:.0f} %" for name, value in percent.items())
+    fractions = "; ".join(f"{name} {value:.0f} %" for name, value in percent.items())
     return Result(
         f"Found: {best}, {SELECTED[merit]} in {percent[best]:.0f} % of {int(counts['n'][best])} "
         "realizations",
-        [Text(f"{SELECTED[merit]}: {shares}")],
+        [Text(f"{SELECTED[merit]}: {fractions}")],
         load='pandas.read_csv("{}/tables/cells.csv")',
         picture="benchmark",
     )

@@ -24,12 +24,12 @@ from ep2sindy.report.results import Metric, Metrics, ResultTable, View
 
 # What the columns of a front mean; RULES explains the labels of the selection rules.
 COLUMNS = (
-    "R2: of the derivative, on rows held out from the fit where there are any; share: of the "
+    "R2: of the derivative, on rows held out from the fit where there are any; fraction: of the "
     "bootstraps that proposed these terms."
 )
 RULES = {
     "d_pareto": "d_pareto: distance to the corner of no error and no terms",
-    "deviance": "deviance: -2 log likelihood of the trajectories plus the prices of all terms, "
+    "deviance": "deviance: -2 log likelihood of the trajectories plus the penalties of all terms, "
     "above the least",
 }
 FRONT = (
@@ -89,7 +89,7 @@ def candidate_metrics(label: str) -> Metrics[CandidateRow]:
         Metric("r2_test", lambda row: row.candidate.r2_test, View.FILES | View.HEADLINE),
         Metric("r2_train", lambda row: row.candidate.r2_train),
         Metric(label, lambda row: row.candidate.score, View.ALL, label, "{:.3f}"),
-        Metric("share", lambda row: row.candidate.share, View.SHOWN, format="{:.2f}"),
+        Metric("fraction", lambda row: row.candidate.fraction, View.SHOWN, format="{:.2f}"),
         Metric("selected", lambda row: row.is_selected),
         Metric(
             "text", lambda row: equation_text(row.candidate.equation, row.candidate.coef_by_term)
@@ -119,7 +119,7 @@ def add_candidates(
     note: str = "",
     beside: Mapping[str, Sequence[CandidateRow]] | None = None,
 ) -> None:
-    """Add the candidates of every state, their front, and terms that the data cannot tell apart.
+    """Add the candidates of every state, their front, and terms that the data cannot distinguish.
 
     name: of the library. note: how the rule decided. beside: other fits of the equations, by state.
     """
@@ -174,14 +174,14 @@ def column_note(label: str) -> str:
 
 def left_over_of_all(tests: Sequence[NoiseTest]) -> list[Text]:
     """What fits of derivatives leave beyond noise; nothing if they leave no more."""
-    if not any(test.misfit for test in tests):
+    if not any(test.lack_of_fit for test in tests):
         return []
     left = [each for test in tests for each in test.left.values() if not each.leaves_noise]
     ratios = sorted(each.chi_squared for each in left)
     size = f"{ratios[0]:.3g} to {ratios[-1]:.3g} times {THE_NOISE}" if left else "more than noise"
     text = (
         f"The equations fitted to derivatives leave {size}: a state or a term is missing there, so "
-        "they have no intervals; the free run above is what judges."
+        "they have no intervals; the free run above is what tests."
     )
     return [Text(text)]
 
@@ -193,7 +193,7 @@ RIVALS: Metrics[Rival] = [
         format=lambda terms: terms.replace("*", " "),
     ),
     Metric(
-        "odds", lambda rival: rival.odds, View.SHOWN, "odds against the chosen",
+        "odds", lambda rival: rival.odds, View.SHOWN, "posterior odds against the chosen",
         lambda odds: f"1:{1.0 / odds:.3g}",
     ),
 ]  # fmt: skip
@@ -218,13 +218,13 @@ ESTIMATE: Metrics[Estimate] = [
     Metric("delays_s", lambda found: by_state(found, found.delays_s)),
     Metric("remarks", lambda found: list(found.remarks)),
     Metric("flow_error", lambda found: found.flow_error),
-    Metric("misfit", lambda found: found.misfit or None),
+    Metric("lack_of_fit", lambda found: found.lack_of_fit or None),
     Metric("too_few_samples", lambda found: found.too_few_samples or None),
 ]  # fmt: skip
 
 
 def add_estimate(report: Report, name: str, found: Discovery) -> None:
-    """Add the noise of the samples, the misfit of the model, and other possible supports.
+    """Add the noise of the samples, the lack of fit of the model, and other possible supports.
 
     name: of the library or signal. found: by a search that estimates states and coefficients.
     """
@@ -236,13 +236,13 @@ def add_estimate(report: Report, name: str, found: Discovery) -> None:
     rows = ResultTable([estimate], ESTIMATE)
     noise = Table(rows.screen(by_state=True), title="noise of the samples", note=NOISE)
     report.table(f"samples_{name}", rows, by_state=True, shown=noise)
-    report.add(Text(estimate.misfit or FITS, warning=bool(estimate.misfit)))
+    report.add(Text(estimate.lack_of_fit or FITS, warning=bool(estimate.lack_of_fit)))
     if estimate.too_few_samples:
         report.add(Text(estimate.too_few_samples, warning=True))
     rivals, title = ResultTable(estimate.rivals, RIVALS), "other supports that may be"
     report.table(f"other_supports_{name}", rivals, title=title)
-    if not estimate.rivals and not estimate.misfit:
-        report.add("No other support of an equation has odds above 1:1000.")
+    if not estimate.rivals and not estimate.lack_of_fit:
+        report.add("No other support of an equation has posterior odds above 1:1000.")
 
 
 def by_state(found: Estimate, values: np.ndarray) -> dict[str, float]:

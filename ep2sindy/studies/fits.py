@@ -54,9 +54,9 @@ from ep2sindy.studies.source import DivergedError, Source, split_in_time, zones_
 from ep2sindy.studies.structures import Structures
 from ep2sindy.studies.study import (
     Count,
+    Fraction,
     Positive,
     PositiveOrAll,
-    Share,
     ZeroOrMore,
 )
 from ep2sindy.studies.views import (
@@ -95,7 +95,7 @@ class Study:
     """Fit structures of models in several ways, run every model freely, and compare them.
 
     models: structures by name. fits: the ways of fitting, by name. forms: forms of the regression
-    besides the formulation, by name. held_out: share at the end of the record over which models
+    besides the formulation, by name. held_out: fraction at the end of the record over which models
     run; None fits and runs over all of it. rollout_s: longest run; None means to the end.
     n_windows, periods, window, n_reweights: of refinements, see `RefinementSettings`. windows:
     lengths for loss against window length. n_draws: number of draws of windows, for the spread of
@@ -109,7 +109,7 @@ class Study:
     fits: Mapping[str, Fit]
     figures: PlotRange
     forms: Mapping[str, Formulation] = field(default_factory=dict)
-    held_out: Share | None = None
+    held_out: Fraction | None = None
     rollout_s: PositiveOrAll = None
     n_windows: Count = 30
     periods: Positive = 2.0

@@ -61,12 +61,13 @@ class Study:
         report.table("lowest_rates", lowest_rates(points))
         percent = 100.0 * by_variant["identified"].mean()
         report.headline |= {f"{n}/identified_percent": float(v) for n, v in percent.items()}
-        shares = "; ".join(f"{name} {share:.0f} %" for name, share in percent.items())
+        fractions = "; ".join(f"{name} {fraction:.0f} %" for name, fraction in percent.items())
         report.found(
             Result(
-                f"Found: {percent.idxmax()} identifies {self.system.name} at the largest share of "
+                f"Found: {percent.idxmax()} identifies {self.system.name} at the largest "
+                "fraction of "
                 f"sampling rates and durations, {percent.max():.0f} %",
-                [Text(f"identified: {shares}")],
+                [Text(f"identified: {fractions}")],
                 load='pandas.read_csv("{}/tables/points.csv")',
                 picture="frontier",
             )
@@ -85,8 +86,8 @@ class Study:
         """
         # The largest comes first: a variant that cannot run at all fails before the work is done.
         points = sorted(product(self.rates_Hz, self.durations_s), reverse=True)
-        judge = partial(_point, self.system, variants, seed=seed, largest=points[:1])
-        rows = rows_in_order(self.parallel, judge, points, "trajectory", progress)
+        assess = partial(_point, self.system, variants, seed=seed, largest=points[:1])
+        rows = rows_in_order(self.parallel, assess, points, "trajectory", progress)
         place = {name: k for k, name in enumerate(variants)}
         rows.sort(key=lambda row: (place[row["variant"]], row["rate_Hz"], row["duration_s"]))
         return pd.DataFrame(rows)

@@ -42,7 +42,7 @@ INTERVALS = (
 LEFT_OUT = (
     "Each point in turn read off the law of the others, and run freely from one sample of its "
     "record, where the states move least. Errors are those against the record's cycle; a model "
-    "lives, its oscillation sustained, within 1 % of frequency, 10 % of amplitude and 0.2 standard "
+    "sustained, within 1 % of frequency, 10 % of amplitude and 0.2 standard "
     "deviations of waveform; enclosed: whether the others enclose it."
 )
 TRIED = (
@@ -61,7 +61,7 @@ CAPTIONS = {
     "left_out": "Points left out, each read off the law of the others. Left: frequency of the free "
     "run over the record's, the band 1 %. Right: errors of amplitude and waveform of each "
     "state, those beyond the panel filled on its edge; band and line are the bounds of a "
-    "model that lives.",
+    "self-sustained model.",
     "map": "Frequency and relative amplitude (standard deviation over mean) of the law's cycle "
     "over the operating parameters, none where it rests, and of the records (circles); "
     "crosses: points that do not oscillate; diamonds: records of another cycle, not fitted here. "
@@ -112,7 +112,8 @@ class FoundLaw:
         if not self.runs:
             return f"{windows}."
         return (
-            f"{windows}, and run freely {found['n_lives']} of {found['n']} points live, diverging: "
+            f"{windows}, and run freely {found['n_sustained']} of {found['n']} points are "
+            "sustained, diverging: "
             f"{found['diverging']}. Errors in the median: frequency {text(found['f_median'])} "
             f"(nine in ten within {text(found['f_90'])}), the worst state's amplitude "
             f"{text(found['amplitude_median'])} and waveform {places(found['waveform_median'], 3)}."
@@ -220,7 +221,8 @@ def add_law(
     head = f"Found: a law of {choice.name} over {', '.join(law.parameters)}"
     if found.runs:
         head += (
-            f", by which {found.statistics['n_lives']} of {len(found.runs)} points left out live"
+            f", by which {found.statistics['n_sustained']} of {len(found.runs)} points left out "
+            "are sustained"
         )
         _add_left_out(report, found)
         shown.append(Text(_add_map(report, found, points, labels)))
@@ -290,9 +292,10 @@ def _add_left_out(report: Report, found: FoundLaw) -> None:
     left_out = report.tables["left_out"]
     if left_out["f_error"].notna().any():
         report.figure("left_out", partial(left_out_figure, left_out), CAPTIONS["left_out"])
-    if not found.statistics["n_lives"]:
+    if not found.statistics["n_sustained"]:
         report.warn(
-            f"none of {len(found.runs)} points left out lives by the law of the others, so it "
+            f"none of {len(found.runs)} points left out is sustained by the law of the others, "
+            "so it "
             "predicts none between them: try points that lie closer together, other models, or "
             "models=null, longer records, and inputs that are states (docs/parametric.md)"
         )

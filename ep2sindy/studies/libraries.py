@@ -29,7 +29,7 @@ from ep2sindy.selection.criteria import Knee
 from ep2sindy.signals.attractor import find_cycle
 from ep2sindy.signals.averaging import average_long
 from ep2sindy.signals.driving import DRIVE, add_drive, ask_whether_driven, drop_repeats
-from ep2sindy.signals.trace import prepare_signal
+from ep2sindy.signals.signal import prepare_signal
 from ep2sindy.studies.balance import add_balance, model_balance
 from ep2sindy.studies.candidates import (
     add_candidates,
@@ -44,7 +44,6 @@ from ep2sindy.studies.library_result import (
     refit,
     refitted_model,
 )
-from ep2sindy.studies.living import LivingSearch, add_living, living_model
 from ep2sindy.studies.processes import NO_ZONES, Zones
 from ep2sindy.studies.source import (
     Sampling,
@@ -54,12 +53,15 @@ from ep2sindy.studies.source import (
     split_in_time,
     zones_of,
 )
-from ep2sindy.studies.study import Coefficients, PositiveOrAll, Share, Terms, ZeroOrMore
+from ep2sindy.studies.study import Coefficients, Fraction, PositiveOrAll, Terms, ZeroOrMore
+from ep2sindy.studies.sustained import SustainedSearch, add_sustained, sustained_model
 from ep2sindy.studies.views import PlotRange, add_figures, add_samples
 from ep2sindy.trust.user_code import load_user_module
 
 FIGURES = ("data", "trajectories", "derivatives", "phase")
-HELD_OUT = 0.25  # share of a record on which a model that lives is tested, unless a config says
+HELD_OUT = (
+    0.25  # fraction of a record on which a self-sustained model is tested, unless a config says
+)
 _FROM_MODULE = re.compile(r"(?P<module>[^\W\d][\w.]*)\.(?P<name>[^\W\d]\w*)(?P<argument>\(.*\))?")
 
 
@@ -108,17 +110,17 @@ class Study:
     formulation, bootstraps: those of the regression rows, also used where the method searches
     trajectories. rollout_s: integration time; None, or a time beyond the data, means to the data's
     end. thesis: published equations by library: state -> term -> SI coefficient. They are fitted as
-    well if the library has the terms and the data can tell them from others. living: how libraries
-    without inputs are searched for a model that lives; None leaves that out. held_out: the last
-    share of the record, on which such a model is tested; None means a quarter. forecasts: number of
-    starts of forecasts, over the held-out part of a living model, or else over the last quarter of
-    the record; zero leaves them out. inputs: variables of every library that are no states.
-    period_s: of a drive that is known by its period, which becomes the inputs `cos_drive` and
-    `sin_drive` of every library. hidden: states that nobody measured, relations between
-    coefficients, terms that an equation may not have (exclude), roles, and means over samples
-    (decimate), as for `discover`.
-    Raises ValueError for hidden states with several libraries or with living, which need samples of
-    all states.
+    well if the library has the terms and the data can tell them from others. sustained: how
+    libraries without inputs are searched for a self-sustained model; None leaves that out.
+    held_out: the last fraction of the record, on which such a model is tested; None means a
+    quarter. forecasts: number of starts of forecasts, over the held-out part of a self-sustained
+    model, or else over the last quarter of the record; zero leaves them out. inputs: variables of
+    every library that are no states. period_s: of a drive that is known by its period, which
+    becomes the inputs `cos_drive` and `sin_drive` of every library. hidden: states that nobody
+    measured, relations between coefficients, terms that an equation may not have (exclude), roles,
+    and means over samples (decimate), as for `discover`. Raises ValueError for hidden states with
+    several libraries or with a search for a self-sustained model, which needs samples of all
+    states.
     """
 
     source: Source
@@ -129,8 +131,8 @@ class Study:
     rollout_s: PositiveOrAll
     figures: PlotRange
     thesis: Mapping[str, Coefficients] = field(default_factory=dict)
-    living: LivingSearch | None = None
-    held_out: Share | None = None
+    sustained: SustainedSearch | None = None
+    held_out: Fraction | None = None
     forecasts: ZeroOrMore = 0
     inputs: Sequence[str] = ()
     period_s: PositiveOrAll = None
@@ -141,14 +143,15 @@ class Study:
     decimate: int | str | None = None
 
     def __post_init__(self) -> None:
-        if self.hidden and (self.living is not None or len(self.libraries) > 1):
+        if self.hidden and (self.sustained is not None or len(self.libraries) > 1):
             raise ValueError(
-                f"hidden states go with one library and without living, got hidden={list(self.hidden)}"
+                "hidden states go with one library and sustained=none, got "
+                f"hidden={list(self.hidden)}"
                 f" with {len(self.libraries)} libraries; take +exp=discover"
             )
-        if self.exclude and self.living is not None:
+        if self.exclude and self.sustained is not None:
             raise ValueError(
-                "exclude goes without living, whose roles say which terms there are, got "
+                "exclude goes with sustained=none, since roles say which terms there are, got "
                 f"exclude={dict(self.exclude)}; take +exp=discover"
             )
 
@@ -163,7 +166,7 @@ class Study:
         # Each case has its own random stream, so that adding a case changes no other.
         streams = np.random.default_rng(report.seed).spawn(len(cases))
         pairs = list(zip(cases.items(), streams, strict=True))
-        zones = NO_ZONES if self.living is None else zones_of(self.source, fields[0], report)
+        zones = NO_ZONES if self.sustained is None else zones_of(self.source, fields[0], report)
         results = {}
         for (name, case), rng in count_pieces(report.watch, pairs, "library"):
             drive = () if self.period_s is None else DRIVE
@@ -202,7 +205,7 @@ class Study:
     def _records(
         self, fields: Sequence[xr.Dataset], cases: Mapping[str, LibraryCase], report: Report
     ) -> list[Trajectory]:
-        """The trajectory of every record, with what is to be said of them."""
+        """The trajectory of every record, with what is to be reported about them."""
         seen = [case.library(fields[0], self.source.trajectory) for case in cases.values()]
         runs = [self.source.sampled(field, seen, report) for field in fields]
         if self.period_s is not None:
@@ -243,7 +246,7 @@ class Study:
     ) -> LibraryResult:
         """Discovery of one library in all records; free runs of its model and the published one.
 
-        The discovered model runs over all records. A model that lives is searched for in the first.
+        The discovered model runs over all records. A self-sustained one is sought in the first.
         """
         measured = runs[0]
         barred = {state: list(map(str, names)) for state, names in (self.exclude or {}).items()}
@@ -255,19 +258,20 @@ class Study:
         n_samples = [run.n_samples if s is None else samples_in(run, s) for run in runs]
         refitted = refit(found, thesis, self.formulation, runs, rng)
         published = refitted_model(found, refitted)
-        lives = beside = None
-        if self.living is not None and not found.model.inputs:
+        sustained = beside = None
+        if self.sustained is not None and not found.model.inputs:
             rows = Regression(self.formulation, bootstraps=self.bootstraps)
             parts = split_in_time(runs[0], self.held_out or HELD_OUT)
-            lives = living_model(
-                *parts, library, rows, self.living, found.model, zones, rng=rng, progress=progress
-            )
+            sustained = sustained_model(
+                *parts, library, rows, self.sustained, found.model, zones, rng=rng,
+                progress=progress,
+            )  # fmt: skip
             beside = model_balance(
-                lives.model, lives.discovery.constraint, runs[0], *parts, zones,
-                self.living.bounds, progress=progress,
+                sustained.model, sustained.discovery.constraint, runs[0], *parts, zones,
+                self.sustained.bounds, progress=progress,
             )  # fmt: skip
         skill = skill_of(
-            found.model if lives is None else lives.model, measured, starts=self.forecasts,
+            found.model if sustained is None else sustained.model, measured, starts=self.forecasts,
             n_fitted=self._n_fitted(measured), progress=progress,
         )  # fmt: skip
         with progress.stage(None, "", "free runs"):
@@ -279,7 +283,7 @@ class Study:
                 thesis=thesis,
                 refitted=refitted,
                 published=None if published is None else over[0](published),
-                living=lives,
+                sustained=sustained,
                 balance=beside,
                 skill=skill,
             )
@@ -291,15 +295,15 @@ class Study:
         results: Mapping[str, LibraryResult],
         files: Sequence[str],
     ) -> None:
-        """All runs, models that live with what tells of them, the selected models, candidates."""
+        """All runs, self-sustained models with their sections, selected models, candidates."""
         report.found(find_best(results, len(files)))
         add_evaluations(report, results, files)
         for name, result in results.items():
-            if result.living is not None and result.balance is not None:
-                add_living(report, name, result.living)
-                add_balance(report, name, result.balance, data, result.living.run.cycle)
+            if result.sustained is not None and result.balance is not None:
+                add_sustained(report, name, result.sustained)
+                add_balance(report, name, result.balance, data, result.sustained.run.cycle)
             if result.skill is not None:
-                where = "that it has seen" if result.living is None else "held out"
+                where = "that it has seen" if result.sustained is None else "held out"
                 title = f"{name}: forecasts over time {where}"
                 add_forecasts(report, name, data, result.skill, title=title)
         self._add_selected(report, data, results)

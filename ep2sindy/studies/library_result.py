@@ -21,12 +21,13 @@ from ep2sindy.report.report import Report
 from ep2sindy.report.results import ResultTable
 from ep2sindy.studies.balance import ModelBalance
 from ep2sindy.studies.candidates import CandidateRow, left_over_of_all, selected_metrics
-from ep2sindy.studies.living import LIVING, Living
 from ep2sindy.studies.study import Coefficients
+from ep2sindy.studies.sustained import SUSTAINED_MODEL, SustainedModel
 from ep2sindy.studies.views import EVALUATED, EVALUATION, best_run, found_model, worst_run
 
 FROM_DERIVATIVES = (
-    "Living models, which free runs select, and equations selected by derivatives and then refined "
+    "Self-sustained models, which free runs select, and equations selected by derivatives and "
+    "then refined "
     "are run over held-out time; the equations that fits of derivatives select, and the thesis's "
     "terms fitted here, over the record from its first sample."
 )
@@ -38,11 +39,11 @@ class LibraryResult:
 
     runs: free runs of the selected model over every record. thesis: the published coefficients as
     printed, by state. refitted: their terms fitted to our rows, and published: the run of that
-    model over the first record; None if a state has none. living: a model that oscillates on its
+    model over the first record; None if a state has none. sustained: a model that oscillates on its
     own; None if none was asked for, or if the library has inputs. balance: of its zone, beside the
-    living model. skill: of forecasts by the living model over its held-out part, or else by the
-    selected one over the last quarter of the record, which it was fitted to; None if there are
-    none.
+    self-sustained model. skill: of forecasts by the self-sustained model over its held-out part, or
+    else by the selected one over the last quarter of the record, which it was fitted to; None if
+    there are none.
     """
 
     discovery: Discovery
@@ -50,7 +51,7 @@ class LibraryResult:
     thesis: Coefficients
     refitted: Mapping[str, Candidate]
     published: Evaluation | None
-    living: Living | None
+    sustained: SustainedModel | None
     balance: ModelBalance | None
     skill: ForecastSkill | None
 
@@ -88,21 +89,24 @@ class LibraryResult:
 def add_evaluations(
     report: Report, results: Mapping[str, LibraryResult], files: Sequence[str]
 ) -> None:
-    """Add how all models run: those that live, the selected over every record, and published."""
+    """Add how all models run: self-sustained, selected over every record, and published."""
     runs: dict[str, Evaluation] = {}
     for name, result in results.items():
-        if result.living is not None:
-            runs |= {f"{name}_living": result.living.run, f"{name}_refined": result.living.refined}
+        if result.sustained is not None:
+            runs |= {
+                f"{name}_living": result.sustained.run,
+                f"{name}_refined": result.sustained.refined,
+            }
         runs |= {name: result.runs[0]}
         others = zip(files[1:], result.runs[1:], strict=True)
         runs |= {f"{name}, {file}": run for file, run in others}
         runs |= {f"{name}_thesis_terms": result.published} if result.published else {}
-    is_living = any(result.living is not None for result in results.values())
+    is_sustained = any(result.sustained is not None for result in results.values())
     rows = ResultTable(runs, EVALUATION)
     shown = Table(
         rows.screen("model", by_state=True),
         title="run freely from one sample",
-        note=f"{FROM_DERIVATIVES} {EVALUATED}" if is_living else EVALUATED,
+        note=f"{FROM_DERIVATIVES} {EVALUATED}" if is_sustained else EVALUATED,
     )
     report.section("How the models run")
     report.table("evaluations", rows, heading="model", shown=shown)
@@ -118,19 +122,25 @@ def add_tables(report: Report, results: Mapping[str, LibraryResult]) -> None:
         rows |= {f"{name}_thesis_terms/{s}": CandidateRow(each) for s, each in refitted}
     label = next(iter(results.values())).discovery.method.selection.label
     report.table("equations", ResultTable(rows, selected_metrics(label)), heading="of", shown=False)
-    living = {f"{name}_living": each.living for name, each in results.items() if each.living}
-    if living:
-        report.table("living", ResultTable(living, LIVING), heading="model", shown=False)
+    sustained = {
+        f"{name}_living": each.sustained for name, each in results.items() if each.sustained
+    }
+    if sustained:
+        report.table(
+            "sustained", ResultTable(sustained, SUSTAINED_MODEL), heading="model", shown=False
+        )
 
 
 def find_best(results: Mapping[str, LibraryResult], n_records: int) -> Result:
-    """The living model, or the best of those that were run; and what its rows leave over.
+    """The self-sustained model, or the best of those that were run; and what its rows leave over.
 
-    A living model was asked to sustain its oscillation, so its free run heads the result; any other
-    model, its forecasts.
+    A self-sustained model was asked to sustain its oscillation, so its free run heads the result;
+    any other model, its forecasts.
     """
-    living = {name: each.living for name, each in results.items() if each.living is not None}
-    if not living:
+    sustained = {
+        name: each.sustained for name, each in results.items() if each.sustained is not None
+    }
+    if not sustained:
         runs = {name: worst_run(each.runs) for name, each in results.items()}
         best = best_run(runs)
         test = results[best].discovery.noise_test
@@ -142,12 +152,12 @@ def find_best(results: Mapping[str, LibraryResult], n_records: int) -> Result:
             skill=results[best].skill,
             where=f"the worst of {n_records} records" if n_records > 1 else "the record",
             seen=True,
-            misfit=test.misfit,
+            lack_of_fit=test.lack_of_fit,
             more=[Text(test.note, warning=True)] if test.note else [],
             held=results[best].discovery.constraint,
         )
-    best = best_run({name: each.run for name, each in living.items()})
-    run = living[best].run
+    best = best_run({name: each.run for name, each in sustained.items()})
+    run = sustained[best].run
     skill = results[best].skill
     words = [Text(f"forecasts of held-out time: {skill.text}")] if skill is not None else []
     caution = [Text(run.caution, warning=True)] if run.caution else []
@@ -159,7 +169,7 @@ def find_best(results: Mapping[str, LibraryResult], n_records: int) -> Result:
         picture="trajectories" if run.cycle is None else f"free_run_{best}",
         more=[*words, *caution, *left_over_of_all(tests)],
         where="held-out time",
-        held=living[best].discovery.constraint,
+        held=sustained[best].discovery.constraint,
     )
 
 

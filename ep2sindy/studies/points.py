@@ -35,8 +35,8 @@ from ep2sindy.report.document import Text
 from ep2sindy.report.report import Report
 from ep2sindy.runtime.parallel import Workers
 from ep2sindy.signals.embedding import Embedded, embed_alike
+from ep2sindy.signals.signal import MIN_PERIODS, prepare_signal
 from ep2sindy.signals.spectrum import Oscillation
-from ep2sindy.signals.trace import MIN_PERIODS, prepare_signal
 from ep2sindy.studies.law_tables import FoundLaw, add_law, find_law
 from ep2sindy.studies.point_sources import (
     Functions,
@@ -132,7 +132,7 @@ class Study:
         if self._given.left_out:
             words = "left out, for their names hold no number there"
             report.say(f"{words}: {', '.join(self._given.left_out)}")
-        self._say_known(report)
+        self._report_known(report)
         sources = self._given.sources
         with report.progress(None, "", "kernels, compiled once"):
             compile_kernels([source.source.data for source in sources])
@@ -341,7 +341,7 @@ class Study:
             found[name] = GivenModel(relations, own.quantities)
         return library, found
 
-    def _say_known(self, report: Report) -> None:
+    def _report_known(self, report: Report) -> None:
         """Beside data of files, say what the models hold for known, and how to change it."""
         known = {name: model.known for name, model in (self.models or {}).items() if model.known}
         if known and "path" in self.source.data.settings:

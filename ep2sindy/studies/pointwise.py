@@ -26,14 +26,14 @@ from ep2sindy.report.report import Report
 from ep2sindy.runtime.parallel import Workers
 from ep2sindy.runtime.progress import Advance
 from ep2sindy.studies.resume import resumed
-from ep2sindy.studies.source import Step, open_prepared, say_field, say_simulation
+from ep2sindy.studies.source import Step, open_prepared, report_field, report_simulation
 from ep2sindy.studies.study import A_LIST, Count, Deferred, Names
 from ep2sindy.thruster.parameters import Thruster
 
 AFTERWARDS = {"max_regimes", "outline"}  # settings that do not change a point's result
 FADING = (
     "It fades to grey where it says little: as the equation's R2 (held-out rows, if any), times "
-    "the share of the bootstraps that have the term, falls to 0."
+    "the fraction of the bootstraps that have the term, falls to 0."
 )
 CAPTIONS = {
     "coefficients": "Coefficient of every term at every point: its sign says source or sink, the "
@@ -53,7 +53,8 @@ MEDIANS = (
     "well (those that act are bold)."
 )
 OVER_ALL = (
-    "selected: share of the fitted points; inclusion: share of the bootstraps. Median, 16 and 84 % "
+    "selected: fraction of the fitted points; inclusion: fraction of the bootstraps. Median, 16 "
+    "and 84 % "
     "over the points that have the term, in the unit named. All values by point, term and equation "
     "lie in pointwise.nc."
 )
@@ -103,7 +104,8 @@ class Study:
     def search(self, library: Library, *, seed: int) -> PointSearch:
         if not isinstance(self.method, Regression):
             raise ValueError(
-                "a search of trajectories fits them whole, and a pointwise study searches rows, got "
+                "a search of trajectories fits them whole, and a pointwise study searches rows, "
+                "got "
                 f"{self.method!r}; use Regression(search=BestSubset()) (search=best_subset)"
             )
         return PointSearch(self.states, library, self.method, self.least_variation, seed)
@@ -111,8 +113,8 @@ class Study:
     def run(self, report: Report) -> None:
         with report.progress(None, "", "data"):
             field = open_prepared(self.data, self.prepare)
-        say_simulation(report, field.attrs)
-        say_field(report, field)
+        report_simulation(report, field.attrs)
+        report_field(report, field)
         lacking = [name for name in self.variables_if_present if name not in field]
         search = self.search(self.library(lacking=lacking), seed=report.seed)
         left_out = [name for name in map(str, self.terms) if name not in search.library.names]
@@ -246,8 +248,9 @@ def _add_regime(report: Report, regimes: Regimes, regime: int) -> None:
 def terms_table(result: xr.Dataset) -> pd.DataFrame:
     """How often each term is selected and how large it is, over all fitted points.
 
-    selected: share of the points. inclusion: share of the bootstraps that have the term, averaged
-    over the points. coef, low, high: median, 16 % and 84 % over the points that have the term.
+    selected: fraction of the points. inclusion: fraction of the bootstraps that have the term,
+    averaged over the points. coef, low, high: median, 16 % and 84 % over the points that have the
+    term.
     """
     fitted = (result["status"] == 0).values
     rows = []
@@ -255,16 +258,16 @@ def terms_table(result: xr.Dataset) -> pd.DataFrame:
         here = result.sel(equation=equation, term=term)
         coef, inclusion = (here[name].values[fitted] for name in ("coef", "inclusion"))
         low, middle, high = spread(coef)
-        shares = np.count_nonzero(coef) / max(coef.size, 1), float(inclusion.mean())
+        fractions = np.count_nonzero(coef) / max(coef.size, 1), float(inclusion.mean())
         unit = str(here["coef_units"].values)
-        rows.append((f"{equation}'", str(term), *shares, middle, low, high, unit))
+        rows.append((f"{equation}'", str(term), *fractions, middle, low, high, unit))
     names = ["equation", "term", "selected", "inclusion", "coef", "low", "high", "unit"]
     return pd.DataFrame(rows, columns=names)
 
 
 def _readable(rows: pd.DataFrame) -> pd.DataFrame:
-    """The columns that are shown, under their headings, with shares in percent."""
-    shares = [name for name in ("selected", "inclusion", "in_support") if name in rows]
-    percent = {name: [f"{share:.0%}" for share in rows[name]] for name in shares}
+    """The columns that are shown, under their headings, with fractions in percent."""
+    fractions = [name for name in ("selected", "inclusion", "in_support") if name in rows]
+    percent = {name: [f"{fraction:.0%}" for fraction in rows[name]] for name in fractions}
     shown = [name for name in HEADINGS if name in rows]
     return rows.assign(**percent)[shown].rename(columns=HEADINGS)

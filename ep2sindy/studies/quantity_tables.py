@@ -30,7 +30,7 @@ LEAST_POINTS = 3  # of a control law
 
 INTERVALS = (
     "±: half the 95 % interval, a sandwich: of least squares with blocks of two periods as "
-    "clusters, of refinements with windows. It says how far another stretch of the same record "
+    "clusters, of refinements with windows. It says how far another segment of the same record "
     "would move a value, not how far the model is from the discharge: compare R2, and the fits. "
     "Nor does it hold the bias that smoothing and differencing leave in least squares, even "
     "without noise, which may be many times as large; refinements differentiate nothing. Refined "
@@ -129,7 +129,8 @@ def read_published(published: Published, parameters: Sequence[str]) -> pd.DataFr
     for fit, columns in published.items():
         if not set(parameters) < set(columns) or len({*map(len, columns.values())}) > 1:
             raise ValueError(
-                f"thesis must give {list(parameters)} and quantities at every point, or be null, got "
+                f"thesis must give {list(parameters)} and quantities at every point, or be null, "
+                "got "
                 f"{dict(columns)} for {fit}"
             )
         for name in columns:

@@ -1,4 +1,4 @@
-"""Runs that go on where they were broken off: what pieces depend on, and what is said."""
+"""Runs that go on where they were broken off: what pieces depend on, and what is reported."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A scan of simulations: settings that take several values, each combination run and judged."""
+"""A scan of simulations: settings that take several values, each combination run and assessed."""
 
 from __future__ import annotations
 

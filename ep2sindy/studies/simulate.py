@@ -34,7 +34,7 @@ from ep2sindy.studies.scan import (
     run_point,
     scan_points,
 )
-from ep2sindy.studies.source import compile_kernels, say_simulation, status_text
+from ep2sindy.studies.source import compile_kernels, report_simulation, status_text
 from ep2sindy.studies.study import Check, Deferred, Positive, PositiveOrAll
 from ep2sindy.thruster.axial.output import POWERS
 from ep2sindy.thruster.cache import write
@@ -57,9 +57,9 @@ PERFORMANCE: list[Metric[Simulated]] = [
     *VERDICT,
     Metric("initial", lambda run: run.get("initial"), View.SHOWN, "start"),
     *MERITS,
-    number("std_share", "standard deviation over mean current", percent(0), View.SHOWN),
+    number("std_fraction", "standard deviation over mean current", percent(0), View.SHOWN),
     number("I_beam_mean", "mean ion beam current", "{:.2f} A"),
-    number("beam_share", "ion beam over discharge current", percent(0), View.SHOWN),
+    number("beam_fraction", "ion beam over discharge current", percent(0), View.SHOWN),
     number("I_wall_mean", "mean ion current to the walls", "{:.2f} A"),
     Metric("rates", lambda run: run.get("rates"), View.SHOWN, "rates of the propellant"),
     number("half_angle_deg", "mean half-angle of the plume", "{:.1f} degrees", View.SHOWN),
@@ -116,7 +116,7 @@ class Study:
         field = self.data.build()
         check_simulation(field, self.data)
         write(field, report.folder.file("field.nc"))
-        say_simulation(report, field.attrs)
+        report_simulation(report, field.attrs)
         run = performance(field)
         f_kHz = float(run.get("f_kHz", np.nan))
         at = f" at {f_kHz:.2f} kHz" if np.isfinite(f_kHz) else ""
@@ -182,13 +182,13 @@ def performance(field: xr.Dataset) -> dict[str, Any]:
     means = {"I_beam": "I_beam_mean", "half_angle": "half_angle_deg"}
     if field.sizes["time"]:
         found |= {key: float(field[name].mean()) for name, key in means.items() if name in field}
-        shares = {"I_d_std": "std_share", "I_beam_mean": "beam_share"}
-        found |= {k: found.get(name, np.nan) / found["I_d_mean"] for name, k in shares.items()}
+        fractions = {"I_d_std": "std_fraction", "I_beam_mean": "beam_fraction"}
+        found |= {k: found.get(name, np.nan) / found["I_d_mean"] for name, k in fractions.items()}
     return found
 
 
 def add_power(report: Report, field: xr.Dataset) -> None:
-    """Add the mean power in W by sink, and its share of the power that the plasma takes."""
+    """Add the mean power in W by sink, and its fraction of the power that the plasma takes."""
     report.section("Where the power goes")
     known = [name for name in POWERS if name in field and field.sizes["time"]]
     power = {name: float(field[name].mean()) for name in known}
@@ -202,7 +202,7 @@ def add_power(report: Report, field: xr.Dataset) -> None:
     metrics: list[Metric[str]] = [
         Metric("goes_to", lambda name: text[name], View.SHOWN, "power"),
         Metric("power_W", lambda name: power[name], View.SHOWN, "W", _tenths),
-        Metric("share", lambda name: 100.0 * power[name] / whole, View.SHOWN, "%", _tenths),
+        Metric("fraction", lambda name: 100.0 * power[name] / whole, View.SHOWN, "%", _tenths),
     ]
     table = ResultTable({name: name for name in power}, metrics)
     shown = Table(table.screen(), breaks=[0], note="Means over the record.")

@@ -64,10 +64,10 @@ def _prepared(data: Deferred, prepare: Sequence[Step]) -> xr.Dataset:
         warnings.simplefilter("ignore", DoubtfulUnit)  # the warning comes once, for the data used
         field: xr.Dataset = data.build()
     check_recorded(field)
-    said = dict(field.attrs)
+    stated = dict(field.attrs)
     for step in prepare:
         field = step(field)
-    return field.assign_attrs(said | field.attrs)
+    return field.assign_attrs(stated | field.attrs)
 
 
 @runtime_checkable
@@ -126,9 +126,9 @@ class Source:
         self, field: xr.Dataset, libraries: Iterable[Library], report: Report
     ) -> Trajectory:
         """The trajectory that the libraries need, which is reported on screen, page and summary."""
-        say_simulation(report, field.attrs)  # first, as it may explain later errors
+        report_simulation(report, field.attrs)  # first, as it may explain later errors
         data = self.trajectory.trajectory(field, inputs=self.inputs(libraries), label=report.title)
-        say_data(report, data, field, self.trajectory.place(field))
+        report_data(report, data, field, self.trajectory.place(field))
         report.summary.setdefault("data", data_summary(data))
         return data
 
@@ -163,13 +163,13 @@ def _balances(sampling: ZoneAverage, field: xr.Dataset, report: Report) -> dict[
         return {}
 
 
-def say_field(report: Report, field: xr.Dataset) -> None:
+def report_field(report: Report, field: xr.Dataset) -> None:
     """Report which data are used, for a study of every grid point."""
     t, clock = grid_points(field, "time"), clock_of(field)
-    _say_samples(report, field, describe_zone(None, field), t, clock)
+    _report_samples(report, field, describe_zone(None, field), t, clock)
 
 
-def say_data(report: Report, data: Trajectory, field: xr.Dataset, place: str) -> None:
+def report_data(report: Report, data: Trajectory, field: xr.Dataset, place: str) -> None:
     """Report the data: file, zone, samples, units, missing values and warnings."""
     units = ", ".join(f"{name} in {unit}" for name, unit in data.units.items())
     frequencies = ", ".join(
@@ -177,14 +177,14 @@ def say_data(report: Report, data: Trajectory, field: xr.Dataset, place: str) ->
         for name, column in zip(data.state_names, data.states.T, strict=True)
     )
     more = [units, f"dominant frequency {frequencies}"]
-    _say_samples(report, field, place, data.t, data.clock, *more)
+    _report_samples(report, field, place, data.t, data.clock, *more)
     if data.n_samples < field.sizes["time"]:
         report.warn(describe_gaps(data.t, field.sizes["time"]))
     elif text := describe_breaks(data.t):
         report.warn(text)
 
 
-def _say_samples(
+def _report_samples(
     report: Report,
     field: xr.Dataset,
     place: str,
@@ -269,8 +269,8 @@ def in_unit(field: xr.Dataset, *, signal: str, unit: str) -> xr.Dataset:
         return field  # the trajectory reports what the data hold
     if (stated := field[signal].attrs.get("units", "1")) != "1":
         raise ValueError(
-            f"unit is for a signal whose unit the data do not say, got {signal} comes in {stated!r}, "
-            f"and unit={unit}; leave unit out, or describe the file by data=file"
+            f"unit is for a signal whose unit the data do not say: {signal} comes in "
+            f"{stated!r}, got unit={unit}; leave unit out, or describe the file by data=file"
         )
     return field.assign({signal: to_si(field[signal], signal, unit, is_variable=True)})
 
@@ -279,7 +279,7 @@ LEAST_SAMPLES = 20  # of the fitted part of a record and of the rest
 
 
 def n_before(run: Trajectory, held_out: float) -> int:
-    """Number of samples before the last `held_out` share of a record."""
+    """Number of samples before the last `held_out` fraction of a record."""
     return round(run.n_samples * (1.0 - held_out))
 
 
@@ -289,7 +289,7 @@ def is_short(run: Trajectory, n_fitted: int) -> bool:
 
 
 def split_in_time(run: Trajectory, held_out: float) -> tuple[Trajectory, Trajectory]:
-    """The first part of a record, and the last `held_out` share of its samples.
+    """The first part of a record, and the last `held_out` fraction of its samples.
 
     Raises ValueError if either part would have fewer than LEAST_SAMPLES samples.
     """
@@ -304,7 +304,7 @@ def split_in_time(run: Trajectory, held_out: float) -> tuple[Trajectory, Traject
 
 # Checks and messages for simulations used as data, and compilation of their kernels.
 
-MIN_SAMPLES = 200  # some breathing periods at the usual step; fewer cannot be judged
+MIN_SAMPLES = 200  # some breathing periods at the usual step; fewer cannot be assessed
 GLIMPSE_SAMPLES = 20
 BALANCE_TOLERANCE = 1e-3  # relative to the inflow; a float32 record closes to 1e-4
 BALANCES = {"mass_balance": "mass", "energy_balance": "energy"}
@@ -314,7 +314,7 @@ VERDICTS = {
     "steady": "the simulation is steady: there is no oscillation to learn from",
     "transit": "the simulation oscillates at {f_kHz:.3g} kHz, above 60 kHz: that is ions in "
     "transit, not breathing",
-    "decaying": "the simulation's oscillation dies out: what is found describes a transient",
+    "decaying": "the simulation's oscillation decays: what is found describes a transient",
 }
 
 
@@ -362,7 +362,7 @@ def doubts(attributes: Mapping[str, Any]) -> list[str]:
     return found
 
 
-def say_simulation(report: Report, attributes: Mapping[str, Any]) -> None:
+def report_simulation(report: Report, attributes: Mapping[str, Any]) -> None:
     """Report a simulation in one line, with its warnings, on screen, page and in the summary."""
     if not is_simulation(attributes):
         return

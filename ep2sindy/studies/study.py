@@ -70,7 +70,7 @@ Count = Annotated[int, Check("a whole number, one or more", _is_count)]
 ZeroOrMore = Annotated[
     int, Check("a whole number, zero or more", lambda x: type(x) is int and x >= 0)
 ]
-Share = Annotated[float, Check("a number between 0 and 1", lambda x: _is_positive(x) and x < 1)]
+Fraction = Annotated[float, Check("a number between 0 and 1", lambda x: _is_positive(x) and x < 1)]
 Positive = Annotated[float, Check("a positive number", _is_positive)]
 PositiveOrAll = Annotated[
     float | None,

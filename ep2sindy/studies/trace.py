@@ -1,4 +1,4 @@
-"""A living model from one measured signal: `+exp=trace`.
+"""A self-sustained model from one measured signal: `+exp=trace`.
 
 States are made of the signal in the ways that the config lists, the first of which look for states
 that nobody measured along with their equations. The model is tested on the end of the record, and
@@ -23,14 +23,14 @@ from ep2sindy.discovery.method import AnyMethod
 from ep2sindy.discovery.one_signal import (
     Attempt,
     Preparation,
-    ToldFacts,
+    StatedFacts,
     best_of,
     fit_offset,
     fitted_part,
     run_on_rest,
     try_in_turn,
 )
-from ep2sindy.figures.living import free_run_figure
+from ep2sindy.figures.free_run import free_run_figure
 from ep2sindy.forecasting.baselines import AUTOREGRESSION
 from ep2sindy.forecasting.evaluation import Evaluation
 from ep2sindy.forecasting.skill import MODEL, ForecastSkill
@@ -40,11 +40,10 @@ from ep2sindy.report.document import Text
 from ep2sindy.report.report import Report
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View, percent
 from ep2sindy.runtime.parallel import Once
-from ep2sindy.signals.driving import add_drive, ask_whether_driven, say_what_is_not_told
-from ep2sindy.signals.trace import Trace, prepare_signal
+from ep2sindy.signals.driving import add_drive, ask_whether_driven, report_unknown_drive
+from ep2sindy.signals.signal import Signal, prepare_signal
 from ep2sindy.studies.candidates import add_candidates, add_estimate
 from ep2sindy.studies.forecasts import add_forecasts
-from ep2sindy.studies.living import CAPTIONS, add_cycle
 from ep2sindy.studies.resume import resumed
 from ep2sindy.studies.source import (
     Source,
@@ -54,12 +53,14 @@ from ep2sindy.studies.source import (
     only,
     zone_of,
 )
-from ep2sindy.studies.study import A_LIST, PositiveOrAll, Share, Terms
+from ep2sindy.studies.study import A_LIST, Fraction, PositiveOrAll, Terms
+from ep2sindy.studies.sustained import CAPTIONS, add_cycle
 from ep2sindy.studies.views import CYCLE, EVALUATED, EVALUATION, add_samples, found_model
 
 NAME = "trace"  # of the model, in files
 NOT_EXPLAINED = (
-    "no equations of the signal and states that nobody measured explain it to its noise and live: "
+    "no equations of the signal and states that nobody measured explain it to its noise and "
+    "sustain its oscillation: "
     "states are made by smoothing"
 )
 
@@ -76,7 +77,7 @@ AS_WELL = 1.15  # largest ratio of two errors of forecasts that count as equal
 
 ERRORS = (
     "Forecasts: up to a period, where the model was fitted, in standard deviations. Unexplained: "
-    "share of the next derivative that neighbours in these states leave."
+    "fraction of the next derivative that neighbours in these states leave."
 )
 PULSES = 1.0  # third moment about the median over the second's 3/2: pulses that stand out upwards
 
@@ -92,11 +93,12 @@ class Study:
     period, which becomes the inputs `cos_drive` and `sin_drive`.
     tried: preparations into states with their libraries, in turn (`Preparation`). Hidden states,
     found along with their equations, end the list if an exact trajectory of these explains the
-    signal to its noise, and lives. Of the others, those that forecast best where they were fitted
-    are taken; of more than two states, only for a signal that does not repeat itself.
-    decimate, detrend: see `prepare_signal`. held_out: the share at the end of the record that is
-    not fitted and serves as the test. keep: whether a run goes on with the finished searches of one
-    that was broken off. exclude, relations, rests_at_zero: known of the equations, see `ToldFacts`.
+    signal to its noise and sustains its oscillation. Of the others, those that forecast best where
+    they were fitted are taken; of more than two states, only for a signal that does not repeat
+    itself. decimate, detrend: see `prepare_signal`. held_out: the fraction at the end of the record
+    that is not fitted and serves as the test. keep: whether a run goes on with the finished
+    searches of one that was broken off. exclude, relations, rests_at_zero: known of the equations,
+    see `StatedFacts`.
     """
 
     source: Source
@@ -106,7 +108,7 @@ class Study:
     tried: Annotated[Sequence[Preparation], A_LIST]
     decimate: int | str | None
     detrend: bool | str
-    held_out: Share
+    held_out: Fraction
     unit: str | None = None
     keep: bool = True
     exclude: Terms | None = None
@@ -120,18 +122,18 @@ class Study:
             raise ValueError(f"offset must be a number or fit, got {self.offset!r}")
 
     @property
-    def told(self) -> ToldFacts:
+    def stated(self) -> StatedFacts:
         """What is known of the equations."""
         barred = {
             state: [str(name) for name in names] for state, names in (self.exclude or {}).items()
         }
-        return ToldFacts(barred, self.relations, self.rests_at_zero)
+        return StatedFacts(barred, self.relations, self.rests_at_zero)
 
     def run(self, report: Report) -> None:
         field, data = self._sampled(report)
         with resumed(self.keep, report) as keeping:
             signal = self._prepared(data, keeping.once, report)
-            self.told.check(self.tried, signal)
+            self.stated.check(self.tried, signal)
             past = fitted_part(signal, self.held_out)
             linear = is_linear(past)
             if linear:
@@ -140,18 +142,18 @@ class Study:
             if question := ask_whether_driven(signal, beside):
                 report.warn(question)
             attempts = try_in_turn(
-                past, self.tried, self.method, told=self.told, linear=linear,
+                past, self.tried, self.method, stated=self.stated, linear=linear,
                 seed=report.seed, progress=report.watch, once=keeping.once,
             )  # fmt: skip
         best = best_of(attempts)
         states, free = run_on_rest(signal, best, progress=report.watch)
         skill = free.forecast
-        self._say_of_choice(signal, best, skill, report, linear=linear)
+        self._report_choice(signal, best, skill, report, linear=linear)
         seen = len(best.states.signal.t) == len(signal.t)
         where = "all of it, too short to hold out" if seen else "its end, which was not fitted"
         remarks = [Text(free.caution, warning=True)] if free.caution else []
-        lives = free.status is Status.SUSTAINED and not question
-        if lives and (remark := say_what_is_not_told(signal)):
+        is_sustained = free.status is Status.SUSTAINED and not question
+        if is_sustained and (remark := report_unknown_drive(signal)):
             remarks.append(Text(remark))
         report.found(
             found_model(
@@ -163,7 +165,7 @@ class Study:
                 more=remarks,
                 where=where,
                 seen=seen,
-                misfit=best.found.misfit,
+                lack_of_fit=best.found.lack_of_fit,
             )
         )
         _add_model(report, signal, best, free, where)
@@ -175,8 +177,8 @@ class Study:
         if best.found.estimate is not None:
             add_estimate(report, signal.name, best.found)
 
-    def _say_of_choice(
-        self, signal: Trace, best: Attempt, skill: ForecastSkill | None, report: Report, *,
+    def _report_choice(
+        self, signal: Signal, best: Attempt, skill: ForecastSkill | None, report: Report, *,
         linear: bool,
     ) -> None:  # fmt: skip
         """Tell what the chosen states and model mean. linear: whether the signal is."""
@@ -188,7 +190,7 @@ class Study:
         if best.is_damped_line and skill is not None and _equals_linear(skill):
             report.say(AR_2)
 
-    def _prepared(self, data: Trajectory, once: Once, report: Report) -> Trace:
+    def _prepared(self, data: Trajectory, once: Once, report: Report) -> Signal:
         """The signal, with its fitted offset if one is asked for."""
         prepare = partial(prepare_signal, decimate=self.decimate, detrend=self.detrend)
         signal = prepare(data)
@@ -232,7 +234,7 @@ def _equals_linear(skill: ForecastSkill) -> bool:
     return bool(1.0 / AS_WELL < ratio < AS_WELL)
 
 
-def lost_mean(signal: Trace) -> str | None:
+def lost_mean(signal: Signal) -> str | None:
     """A message if the signal is one-sided pulses about a mean of zero; otherwise None."""
     away = signal.x - np.median(signal.x)
     one_way = float(np.mean(away**3) / np.mean(away**2) ** 1.5)
@@ -245,11 +247,11 @@ def lost_mean(signal: Trace) -> str | None:
     )
 
 
-def _add_model(report: Report, signal: Trace, best: Attempt, free: Evaluation, where: str) -> None:
+def _add_model(report: Report, signal: Signal, best: Attempt, free: Evaluation, where: str) -> None:
     """Add the model, and how it runs over the samples that were not fitted."""
     model = best.found.model
     note = best.found.note
-    report.section("The model", *([note] if note != best.found.misfit else []))
+    report.section("The model", *([note] if note != best.found.lack_of_fit else []))
     report.model(NAME, model, clock=signal.clock)
     draw = partial(free_run_figure, free.record, free.rollout, period_s=signal.period_s)
     report.figure(f"free_run_{NAME}", draw, CAPTIONS["free_run"])
@@ -266,14 +268,14 @@ def _add_model(report: Report, signal: Trace, best: Attempt, free: Evaluation, w
 
 
 def _add_signal(
-    report: Report, signal: Trace, states: Trajectory, attempts: Sequence[Attempt], best: Attempt
+    report: Report, signal: Signal, states: Trajectory, attempts: Sequence[Attempt], best: Attempt
 ) -> None:
     """Add the signal, the states that were made of it, and other states that were tried."""
     embedding, known = best.states.embedding, best.states.known
     per_period = signal.period_s / states.dt_s
     turns = "periods" if signal.cycle is not None else "turns, which do not repeat themselves,"
     too_fast = "" if embedding.how == "hidden" else ", and what is too fast to be followed"
-    share = 100.0 * best.noise_std / signal.x.std()
+    fraction = 100.0 * best.noise_std / signal.x.std()
     noise = f"{best.noise_std:.3g} {signal.unit}".removesuffix(" 1")
     moves = ", ".join(f"{state} by {size:.2g}" for state, size in best.process_noise_std.items())
     exact = ", ".join(f"{state}' = {term.replace('*', ' ')}" for state, term in known.items())
@@ -283,7 +285,7 @@ def _add_signal(
         f"{per_period:.0f} samples",
         f"states: {embedding.says}, {', '.join(states.state_names)} ({best.states.reason})"
         f"{'; known: ' if exact else ''}{exact}",
-        f"noise{too_fast}: {noise}, {share:.2g} % of the standard deviation",
+        f"noise{too_fast}: {noise}, {fraction:.2g} % of the standard deviation",
         f"process noise, which moves the states at random beside the model in a step: {moves} (SI)",
         *signal.done,
     )
@@ -305,7 +307,7 @@ def _add_signal(
         "known": dict(known),
         "noise_std": best.noise_std,
         "process_noise_std": best.process_noise_std,
-        "misfit": best.found.misfit,
+        "lack_of_fit": best.found.lack_of_fit,
         "note": best.found.note,
     }
 
@@ -316,5 +318,5 @@ TRIED: Metrics[Attempt] = [
     Metric("n_states", lambda tried: tried.preparation.n_states),
     Metric("degree", lambda tried: tried.preparation.degree, View.SHOWN),
     Metric("error", lambda tried: tried.error, View.SHOWN, "error of forecasts", "{:.3f}"),
-    Metric("unexplained", lambda tried: tried.share, View.SHOWN, format=percent(2)),
+    Metric("unexplained", lambda tried: tried.fraction, View.SHOWN, format=percent(2)),
 ]

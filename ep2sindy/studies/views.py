@@ -137,19 +137,19 @@ def found_model(
     more: Sequence[Block] = (),
     where: str,
     seen: bool = False,
-    misfit: str = "",
+    lack_of_fit: str = "",
     held: Constraint | None = None,
 ) -> Result:
     """A model as what was found: what it foresees, its equations, and how it runs.
 
     found: how it was found, such as `Found from I_d`. file: its name among the run's models. skill:
     of its forecasts, which are the headline; without them it is how the model runs. where: what it
-    was run over, in words, such as `held-out time`. seen: whether it was fitted to that. misfit:
-    why it does not explain the data, a warning; may be empty. held: that its coefficients obey, if
-    it was found under roles.
+    was run over, in words, such as `held-out time`. seen: whether it was fitted to that. lack of
+    fit: why it does not explain the data, a warning; may be empty. held: that its coefficients
+    obey, if it was found under roles.
     """
     clock, model = run.rollout.clock, run.model
-    fate = _fate(run, seen=seen, misfit=misfit)
+    fate = _fate(run, seen=seen, lack_of_fit=lack_of_fit)
     free = run_words(run) if skill is None else f"{fate}; {run_words(run)}"
     headline = f"a model that {fate}" if skill is None else skill.headline
     freely = [f"run freely from one sample over {where}: {free}", *run.rest_texts]
@@ -160,7 +160,7 @@ def found_model(
         [
             *equations(model, clock, held=held),
             *map(Text, freely),
-            *([Text(misfit, warning=True)] if misfit else []),
+            *([Text(lack_of_fit, warning=True)] if lack_of_fit else []),
             *more,
         ],
         load=f'ep.SparseModel.load("{{}}/models/{file}.json")',
@@ -168,7 +168,7 @@ def found_model(
     )
 
 
-def _fate(run: Evaluation, *, seen: bool, misfit: str) -> str:
+def _fate(run: Evaluation, *, seen: bool, lack_of_fit: str) -> str:
     """`sustains the oscillation`, `has the wrong cycle`, `diverges after 12 us`."""
     words = {
         Status.SUSTAINED: "keeps the oscillation under its inputs"
@@ -181,7 +181,7 @@ def _fate(run: Evaluation, *, seen: bool, misfit: str) -> str:
     if not run.is_similar:
         return words.get(run.status, run.text)
     if run.status is Status.NO_CYCLE:
-        if misfit:
+        if lack_of_fit:
             return "does not explain the data"
         words[Status.NO_CYCLE] = "has the means and amplitudes of the data"
     return f"{words[run.status]}{' where it was fitted' if seen else ''}"
@@ -239,11 +239,12 @@ EVALUATION: Metrics[Evaluation] = [
     Metric("periods", lambda run: run.periods, View.SHOWN, "periods in phase", "{:.0f}"),
     Metric("status", lambda run: run.text, View.SHOWN),
 ]
-# Its cycle and where it rests, which take many runs: of the models that are to live.
+# Its cycle and where it rests, which take many runs: of models that are to sustain their
+# oscillation.
 CYCLE: Metrics[Evaluation] = [
     Metric("stability", lambda run: run.cycle and run.cycle.stability),
     Metric("multiplier", lambda run: run.multiplier, COMPARED),
-    Metric("share_reaching", lambda run: run.share_reaching, COMPARED),
+    Metric("basin_stability", lambda run: run.basin_stability, COMPARED),
     Metric("rest", lambda run: _rest(run)),
     Metric("rest_growth_per_s", lambda run: run.rest and run.rest.growth_per_s),
     Metric("rest_frequency_Hz", lambda run: run.rest and run.rest.frequency_Hz),

@@ -31,7 +31,7 @@ def read_or_run(
 ) -> xr.Dataset:  # fmt: skip
     """The result of `run`, read from a file in the folder `cache`, or run and kept there.
 
-    True: the user's own folder; where there is none, this is said, and nothing is kept. None or
+    True: the user's own folder; where there is none, this is reported, and nothing is kept. None or
     False: nothing is kept. The hash in the file's name covers all parameters and the
     source text of SOURCES, so that a changed formula never returns an old result. Both ways return
     the same values. The file states its parameters, and HDF5 checks its values by checksums. A file
@@ -48,7 +48,7 @@ def read_or_run(
         try:
             return _of(read(path), text)
         except (OSError, ValueError, KeyError, RuntimeError) as error:
-            _say(f"{path} cannot be read ({error}); simulating it again")
+            _report(f"{path} cannot be read ({error}); simulating it again")
     with writing(path.parent):  # checked now, not after the simulation
         path.parent.mkdir(parents=True, exist_ok=True)
         sweep(path.parent)
@@ -67,11 +67,11 @@ def _folder(cache: str | Path | bool | None) -> Path | None:
     try:
         return cache_folder("simulations", fingerprint("", sources=SOURCES))
     except OSError as error:
-        _say(f"the simulation is not kept: {error}")
+        _report(f"the simulation is not kept: {error}")
         return None
 
 
-def _say(text: str) -> None:
+def _report(text: str) -> None:
     with on_screen(sys.stdout):
         tqdm.write(in_line(text))
 

@@ -53,14 +53,14 @@ def _interpolate_table(
     T_eV: Float[np.ndarray, " rows"],
     rates: Float[np.ndarray, " rows"],
     T_e_eV: xr.DataArray,
-    way_out: str,
+    hint: str,
 ) -> Callable:
     """Interpolate linearly in a table, which must cover all temperatures."""
     low, high = float(T_e_eV.min()), float(T_e_eV.max())
     if low < T_eV[0] or high > T_eV[-1]:
         raise ValueError(
             f"T_e_eV must stay in the rate table, {T_eV[0]:g} to {T_eV[-1]:g} eV: it runs "
-            f"from {low:g} to {high:g} eV; {way_out}"
+            f"from {low:g} to {high:g} eV; {hint}"
         )
     return lambda T: np.interp(T, T_eV, rates)
 
@@ -74,9 +74,9 @@ def read_rate_table(
     gaps = [row for row in rows if len(row) < 2 or None in map(number, row)]
     columns = np.array([] if gaps else rows, dtype=np.float64).reshape(-1, 2)
     if len(columns) < 2 or np.any(np.diff(columns[:, 0]) <= 0):
-        said = f"a row {gaps[0]}" if gaps else f"{len(columns)} rows of numbers"
+        stated = f"a row {gaps[0]}" if gaps else f"{len(columns)} rows of numbers"
         raise ValueError(
             f"a rate table must have two columns, T_e in eV (increasing) and rate in m^3/s, and "
-            f"two rows or more: {path} has {said}"
+            f"two rows or more: {path} has {stated}"
         )
     return columns[:, 0], columns[:, 1]

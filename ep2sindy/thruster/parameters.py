@@ -53,20 +53,22 @@ class Circuit:
 
 @dataclass(frozen=True)
 class ModulatedVoltage:
-    """The operating point's voltage V_0, modulated: V_0 (1 + share sin(2 pi frequency t)).
+    """The operating point's voltage V_0, modulated: V_0 (1 + fraction sin(2 pi frequency t)).
 
-    share: amplitude relative to V_0, above 0 and below 1. The modulation begins at t = 0, where the
-    record does. Raises ValueError for a share out of range or a frequency that is not positive.
+    fraction: amplitude relative to V_0, above 0 and below 1. The modulation begins at t = 0, where
+    the record does. Raises ValueError for a fraction out of range or a frequency that is not
+    positive.
     """
 
-    share: float
+    fraction: float
     frequency_Hz: float
 
     def __post_init__(self) -> None:
-        check_positive(self, "share", "frequency_Hz")
-        if self.share >= 1.0:
+        check_positive(self, "fraction", "frequency_Hz")
+        if self.fraction >= 1.0:
             raise ValueError(
-                f"ModulatedVoltage.share must be below 1, or the supply turns round, got {self.share:g}"
+                "ModulatedVoltage.fraction must be below 1, or the supply turns round, got "
+                f"{self.fraction:g}"
                 "; 0.05 is five per cent"
             )
 
@@ -76,7 +78,7 @@ class ModulatedVoltage:
     def at(self, t: Volts, voltage: float) -> Volts:
         """Voltage in V at times in s, constant before t = 0."""
         phase = 2.0 * np.pi * self.frequency_Hz * np.maximum(t, 0.0)
-        return voltage * (1.0 + self.share * np.sin(phase))
+        return voltage * (1.0 + self.fraction * np.sin(phase))
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 Both plumes spread between two cones: at a distance x beyond the exit, the outer radius has grown by
 h and the inner one has shrunk by h, to zero at least, where dh/dx is the tangent of the half-angle
-there. They share `tangents`.
+there. They fraction `tangents`.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class ConicalPlume:
     half_angle_deg: 0 to 45. axial_thrust: if True, thrust is the axial part of the ions' momentum,
     cos(angle) A sum(m n u^2) at the cathode plane; if False, all of it. True is right where the
     ions' speed stands for the whole drop of the potential, as in every 1-D model; HallThruster.jl
-    (apply_thrust_divergence_correction) has the same factor and takes False unless told.
+    (apply_thrust_divergence_correction) has the same factor and takes False unless set.
     Raises ValueError for an angle out of range.
     """
 

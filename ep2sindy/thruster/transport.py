@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ep2sindy.thruster.checks import check_not_negative, check_positive, set_profile
-from ep2sindy.thruster.walls import share
+from ep2sindy.thruster.walls import fraction
 from ep2sindy.trust.user_code import identify, load_marked
 
 Points = Sequence[float] | Float[np.ndarray, " points"]
@@ -35,7 +35,7 @@ class AnomalousTransport:
 
     def at(self, distance: Float[np.ndarray, " z"]) -> Float[np.ndarray, " z"]:
         """Coefficient c at a distance from the exit in m."""
-        return share(distance, self.c_channel, self.c_plume, self.transition)
+        return fraction(distance, self.c_channel, self.c_plume, self.transition)
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class GaussianTransport:
     """One level with a trough: c = c_far (1 - (1 - trough) exp(-((d - center)/width)^2 / 2)).
 
     center: distance of the trough from the exit in m. width: its standard deviation in m.
-    trough: c at its middle, as a share of c_far. Source: GaussianBohm of HallThruster.jl,
+    trough: c at its middle, as a fraction of c_far. Source: GaussianBohm of HallThruster.jl,
     Marks et al., JOSS 8 (2023) 4672.
     """
 
@@ -149,7 +149,7 @@ class FunctionTransport:
     `Plasma`, and gives c at each distance or one number. In a config it is the dotted name of a
     function marked with `@ep.for_configs`, as `my_module.c`. Numbers that vary belong into a frozen
     dataclass with `__call__`. At the very first call the field may be zero, for none is known yet.
-    identity: module, name and hash of the source, by which kept simulations are told apart.
+    identity: module, name and hash of the source, by which kept simulations are distinguished.
     Raises ValueError for a function that is not there or not known by its source.
     """
 

@@ -18,13 +18,13 @@ from ep2sindy.thruster.parameters import OperatingPoint
 STANDARD_GRAVITY = 9.80665  # m/s^2, exact (CGPM 1901)
 TRANSIT_HZ = 60e3  # ions cross the domain in microseconds; the breathing mode is slower
 BREATHING = replace(SIMULATED, max_Hz=TRANSIT_HZ)
-STRONG_SHARE = 0.9  # of the mean: the strong cycle has a larger standard deviation
+STRONG_FRACTION = 0.9  # of the mean: the strong cycle has a larger standard deviation
 SAME_PEAKS, MOST_CYCLES = 0.01, 16  # of their mean; how many cycles it takes to tell
 GONE_A = 1e-9  # no discharge comes back from it
-OUT_SHARE = 0.1  # of the current that the gas carries if each of its atoms is ionised once
+OUT_FRACTION = 0.1  # of the current that the gas carries if each of its atoms is ionised once
 
 
-def judge_status(current: Float[np.ndarray, " time"], sample_s: float) -> str:
+def assess_status(current: Float[np.ndarray, " time"], sample_s: float) -> str:
     """Status of the current at the end of the record: oscillating, transit, steady or decaying.
 
     The second half is cut into four blocks. The status is steady if the last block varies by less
@@ -69,16 +69,16 @@ def diagnose(field: xr.Dataset, *, diverged: bool, flow_A: float) -> dict[str, A
     current, time = field["I_d"].values, field["time"].values
     if diverged:  # without a source of electrons a current falls until nothing can be divided by
         status = "out" if current.size and abs(current[-1]) < GONE_A else "diverged"
-    elif current[current.size // 2 :].mean() < OUT_SHARE * flow_A:
+    elif current[current.size // 2 :].mean() < OUT_FRACTION * flow_A:
         status = "out"
     else:
-        status = judge_status(current, float(time[1] - time[0]))
+        status = assess_status(current, float(time[1] - time[0]))
     moves = status in ("oscillating", "transit")
     f_Hz = dominant_frequency(time, current) if moves else math.nan
     mean, std = (float(current.mean()), float(current.std())) if current.size else (np.nan,) * 2
     cycle, again, spread = "none", math.nan, math.nan
     if status == "oscillating":
-        cycle = "strong" if std > STRONG_SHARE * mean else "weak"
+        cycle = "strong" if std > STRONG_FRACTION * mean else "weak"
         late = current[current.size // 2 :]
         again, spread = multiplicity(cycle_peaks(late, float(time[1] - time[0]), f_Hz))
     return {

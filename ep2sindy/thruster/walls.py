@@ -27,7 +27,7 @@ MATERIALS: dict[str, tuple[float, float]] = {
 FloatArray = Float[np.ndarray, "..."] | np.float64
 
 
-def share(
+def fraction(
     distance: Float[np.ndarray, " z"], channel: float, plume: float, transition: float
 ) -> Float[np.ndarray, " z"]:
     """From `channel` to `plume` across the exit: a step, or linear over `transition` in m."""
@@ -38,7 +38,7 @@ def share(
 
 @runtime_checkable
 class Wall(Protocol):
-    """What a wall takes: per electron by T_e, and the shares at distances from the exit in m."""
+    """What a wall takes: per electron by T_e, and the fractions at distances from the exit in m."""
 
     def ion_loss(self, T_e_eV: FloatArray, gap: float, ion_mass: float) -> FloatArray: ...
     def collision(self, T_e_eV: FloatArray, gap: float, ion_mass: float) -> FloatArray: ...
@@ -55,11 +55,11 @@ class SheathWall:
     gamma = min(gamma_max, yield_0 + (1 - yield_0) 1.5 T_e / crossover_eV), where gamma_max = 1 -
     8.3 sqrt(m_e/m) is the space-charge limit. Electrons collide with the wall at nu_w =
     electron_scale 0.4965 sqrt(e T_e/m) / (gap (1 - gamma)). Each collision costs 2 T_e + (1 -
-    gamma) phi_w, phi_w = T_e ln((1 - gamma) sqrt(m / (2 pi m_e))). Beyond the exit, the share
-    `plume_collisions` of the collisions and the share `plume_power` of the power remain; ions are
-    lost in the channel only. transition: length in m over which the shares change at the exit.
-    shielded_T_e_eV: temperature at the walls of a magnetically shielded thruster, whose field lines
-    bring the anode's cold electrons there; it replaces T_e in all losses. None: not shielded.
+    gamma) phi_w, phi_w = T_e ln((1 - gamma) sqrt(m / (2 pi m_e))). Beyond the exit, the fraction
+    `plume_collisions` of the collisions and the fraction `plume_power` of the power remain; ions
+    are lost in the channel only. transition: length in m over which the fractions change at the
+    exit. shielded_T_e_eV: temperature at the walls of a magnetically shielded thruster, whose field
+    lines bring the anode's cold electrons there; it replaces T_e in all losses. None: not shielded.
     Default: BN-SiO2. Sources: Marks et al., JOSS 8 (2023) 4672; Goebel & Katz, chapter 7.
     """
 
@@ -114,16 +114,16 @@ class SheathWall:
         return self.collision(T, gap, ion_mass) * (2.0 * T + kept * sheath)
 
     def ion_weight(self, distance: Float[np.ndarray, " z"]) -> Float[np.ndarray, " z"]:
-        """Share of the ion loss at a distance from the exit in m, negative inside."""
-        return share(distance, 1.0, 0.0, self.transition)
+        """Fraction of the ion loss at a distance from the exit in m, negative inside."""
+        return fraction(distance, 1.0, 0.0, self.transition)
 
     def collision_weight(self, distance: Float[np.ndarray, " z"]) -> Float[np.ndarray, " z"]:
-        """Share of the electrons' wall collisions at a distance from the exit in m."""
-        return share(distance, 1.0, self.plume_collisions, self.transition)
+        """Fraction of the electrons' wall collisions at a distance from the exit in m."""
+        return fraction(distance, 1.0, self.plume_collisions, self.transition)
 
     def power_weight(self, distance: Float[np.ndarray, " z"]) -> Float[np.ndarray, " z"]:
-        """Share of the power loss at a distance from the exit in m."""
-        return share(distance, 1.0, self.plume_power, self.transition)
+        """Fraction of the power loss at a distance from the exit in m."""
+        return fraction(distance, 1.0, self.plume_power, self.transition)
 
 
 def wall_material(

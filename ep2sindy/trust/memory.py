@@ -26,10 +26,10 @@ def free_bytes() -> int:
     return max(free, 0)
 
 
-def check_memory(n_bytes: float, what: str, *, way_out: str, each: float = 0.0) -> None:
+def check_memory(n_bytes: float, what: str, *, hint: str, each: float = 0.0) -> None:
     """Raise ValueError if one or several arrays would take more memory than is free.
 
-    what, way_out: texts for the message. each: bytes per piece; if given, the message says how
+    what, hint: texts for the message. each: bytes per piece; if given, the message says how
     many pieces would fit.
     """
     if n_bytes <= UNCOUNTED or n_bytes <= (free := free_bytes()):
@@ -37,5 +37,5 @@ def check_memory(n_bytes: float, what: str, *, way_out: str, each: float = 0.0) 
     fit = f", which hold {int(free // each)}" if each else ""
     raise ValueError(
         f"{what} would take {n_bytes / 1e9:.3g} GB of memory: {free / 1e9:.3g} GB are free{fit}; "
-        f"{way_out}"
+        f"{hint}"
     )

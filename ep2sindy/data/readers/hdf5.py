@@ -58,8 +58,8 @@ def read_hdf5(path: Path) -> FileSource:
     names = names_in_hdf5(path)
     beside = {name: array for name, array in beside.items() if name not in names}
     with h5py.File(path) as file:
-        said = {key: _plain(value) for key, value in file.attrs.items()}
-    numbers = {key: value for key, value in said.items() if isinstance(value, int | float)}
+        stated = {key: _plain(value) for key, value in file.attrs.items()}
+    numbers = {key: value for key, value in stated.items() if isinstance(value, int | float)}
     return FileSource(path, [*names, *beside], read, attributes=numbers)
 
 
@@ -110,8 +110,8 @@ def _mesh(name: str, item: h5py.Group | h5py.Dataset) -> dict[str, xr.DataArray]
 
 def _has_modes(found: h5py.Dataset) -> bool:
     """True for a record of openPMD whose first axis holds azimuthal modes."""
-    said = (each.attrs.get("geometry") for each in (found, found.parent))
-    return "thetaMode" in (_plain(geometry) for geometry in said)
+    stated = (each.attrs.get("geometry") for each in (found, found.parent))
+    return "thetaMode" in (_plain(geometry) for geometry in stated)
 
 
 def _openpmd_unit(attributes: h5py.AttributeManager) -> str:
@@ -172,9 +172,7 @@ def stored_array(path: Path, found: h5py.Dataset) -> xr.DataArray:
         return xr.DataArray(found[()])
     # Read whole: a vector, as times are, and one mark for each chunk that says if it was written.
     n_bytes = found.size * found.dtype.itemsize if found.ndim < 2 else prod(_counts(found))
-    check_memory(
-        float(n_bytes), repr(found.name), way_out="copy the part that you need into a file"
-    )
+    check_memory(float(n_bytes), repr(found.name), hint="copy the part that you need into a file")
     stored = _Stored(path, found)
     if not stored.written.any():
         raise ValueError(f"{found.name!r} was never written: the file holds its shape alone")
@@ -213,15 +211,15 @@ def _attributes(found: h5py.Dataset, name: str) -> dict[str, Any]:
 
     An empty attribute means no unit; raises ValueError for an empty packing attribute.
     """
-    said = {key: _plain(found.attrs[key]) for key in (*PACKING, *UNITS) if key in found.attrs}
-    attrs = {key: said[key] for key in PACKING if key in said}
+    stated = {key: _plain(found.attrs[key]) for key in (*PACKING, *UNITS) if key in found.attrs}
+    attrs = {key: stated[key] for key in PACKING if key in stated}
     if empty := [key for key, value in attrs.items() if value is None]:
         raise ValueError(
             f"{empty[0]} of {name!r} must be a number: the attribute is empty, its dataspace is "
             "null; give it a value, or take it away"
         )
     check_packing(name, attrs)
-    units = next((said[key] or "" for key in UNITS if key in said), "")
+    units = next((stated[key] or "" for key in UNITS if key in stated), "")
     return attrs | {"units": units or _openpmd_unit(found.attrs)}
 
 

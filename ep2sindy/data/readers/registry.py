@@ -33,7 +33,7 @@ def open_source(path: Path) -> FileSource:
             "'ep2sindy[files]', or save it as CSV"
         )
     if reader not in READ_LATER:  # its values take about as many bytes, or more
-        check_memory(float(path.stat().st_size), f"{path}, which is read at once,", way_out=SMALLER)
+        check_memory(float(path.stat().st_size), f"{path}, which is read at once,", hint=SMALLER)
     with damage_named(path):
         return replace(reader.open(path), kind=reader.name)
 
@@ -56,12 +56,12 @@ def reader_of(path: Path) -> Reader:
     if form == "folder":
         folders = joined([e for r in READERS if r.form == "folder" for e in r.endings], "or")
         counts = Counter(each.suffix for each in path.iterdir() if each.is_file() and each.suffix)
-        way_out = ", with no files in it"
+        hint = ", with no files in it"
         if counts:
             (most, n), *_ = counts.most_common(1)
-            way_out = f"; take its {n} files that end in {most}, '{path}/*{most}'"
+            hint = f"; take its {n} files that end in {most}, '{path}/*{most}'"
         raise ValueError(
-            f"a file must come, or a folder that ends in {folders}: {path} is a folder{way_out}"
+            f"a file must come, or a folder that ends in {folders}: {path} is a folder{hint}"
         )
     by_ending = [r for r in READERS if r.form in ("other", "folder")]
     kinds = joined([r.name for r in READERS if r not in by_ending], "or")

@@ -95,8 +95,8 @@ def _form(
     filled = {s: [cells for cells, line in zip(table, lines, strict=True) if DIGIT.search(line)]
               for s, table in tables.items()}  # fmt: skip
     options = [(*_rate(table, d), s, d) for d in PLAIN for s, table in filled.items()]
-    share, _, columns, separator, decimal = max(options, key=lambda option: option[:2])
-    if not share:
+    fraction, _, columns, separator, decimal = max(options, key=lambda option: option[:2])
+    if not fraction:
         raise ValueError("it holds no rows of numbers")
     table = tables[separator]
     numbers = [row[j] for row in table for j in columns if j < len(row)]
@@ -122,17 +122,18 @@ def _split(lines: Sequence[str], separator: str | None) -> list[list[str]]:
 
 
 def _rate(table: Sequence[Sequence[str]], decimal: str) -> tuple[float, int, tuple[int, ...]]:
-    """Mean share of numbers in a line, number of numeric columns, and their indices.
+    """Mean fraction of numbers in a line, number of numeric columns, and their indices.
 
-    table: cells of the lines that hold a digit; columns are told from those of the usual width.
+    table: cells of the lines that hold a digit; columns are distinguished from those of the usual
+    width.
     """
     number = NUMBERS[decimal].fullmatch
     present = [[cell for cell in cells if cell.lower() not in MISSING] for cells in table]
-    shares = [sum(map(bool, map(number, cells))) / max(len(cells), 1) for cells in present]
+    fractions = [sum(map(bool, map(number, cells))) / max(len(cells), 1) for cells in present]
     widths = Counter(map(len, table))
     usual = max(widths, key=lambda n: (widths[n], n), default=0)
     columns = _numeric([cells for cells in table if len(cells) == usual], decimal)
-    return (sum(shares) / len(shares) if columns else 0.0), len(columns), columns
+    return (sum(fractions) / len(fractions) if columns else 0.0), len(columns), columns
 
 
 def _numeric(rows: Sequence[Sequence[str]], decimal: str) -> tuple[int, ...]:
@@ -146,7 +147,7 @@ def _numeric(rows: Sequence[Sequence[str]], decimal: str) -> tuple[int, ...]:
         n_numbers = sum(map(bool, map(NUMBERS[decimal].fullmatch, cells)))
         if n_numbers > 0.5 * len(cells):
             filled[j] = n_numbers / len(rows)
-    dense = [j for j, share in filled.items() if share > 0.25]
+    dense = [j for j, fraction in filled.items() if fraction > 0.25]
     return tuple(dense if dense and dense[0] > 1 else filled)
 
 
@@ -172,8 +173,8 @@ def _decimal(cells: Sequence[str], separator: str | None, rated: str) -> str:
 def _is_row(cells: Sequence[str], columns: Sequence[int], decimal: str) -> bool:
     """True if all numeric columns hold numbers or notations for missing samples, and one at all."""
     at = [cells[j] if j < len(cells) else "" for j in columns]
-    said = any(cell.strip("-") for cell in at)
-    return said and all(NUMBERS[decimal].fullmatch(c) or c.lower() in MISSING for c in at)
+    stated = any(cell.strip("-") for cell in at)
+    return stated and all(NUMBERS[decimal].fullmatch(c) or c.lower() in MISSING for c in at)
 
 
 def _first_row(
@@ -258,10 +259,10 @@ def header_of(
         return numbered
     if not has_units and not is_comment:
         _check_names(above)
-    said = [_unit(cell) for cell in units]
-    header = split_names(names, [*said, *[""] * n_columns][:n_columns])
+    stated = [_unit(cell) for cell in units]
+    header = split_names(names, [*stated, *[""] * n_columns][:n_columns])
     if header.names[0].lower() in TIMES and not any(header.units):
-        header = replace(header, units=_units_said(above, n_columns))
+        header = replace(header, units=_stated_units(above, n_columns))
     return replace(header, step_s=step_s)
 
 
@@ -292,12 +293,12 @@ def _labels_beside(header: Header, rows: Sequence[Sequence[str]], columns: Seque
     Older oscilloscopes of Tektronix write it there, one line in each row.
     """
     labels = [row[: columns[0]] for row in rows]
-    units = dict(zip(columns, _units_said(labels, len(columns)), strict=True))
-    said = tuple(units.get(j, "") for j in range(len(header.units)))
-    return replace(header, units=said, step_s=header.step_s or _step_s(labels))
+    units = dict(zip(columns, _stated_units(labels, len(columns)), strict=True))
+    stated = tuple(units.get(j, "") for j in range(len(header.units)))
+    return replace(header, units=stated, step_s=header.step_s or _step_s(labels))
 
 
-def _units_said(above: Sequence[Sequence[str]], n_columns: int) -> tuple[str, ...]:
+def _stated_units(above: Sequence[Sequence[str]], n_columns: int) -> tuple[str, ...]:
     """Units of the columns, time first, as lines of a preamble give them; "" where none does."""
     time, values = "", [""]
     for label, *cells in filter(None, above):
@@ -315,7 +316,7 @@ def _units_said(above: Sequence[Sequence[str]], n_columns: int) -> tuple[str, ..
 
 
 def split_names(names: Sequence[str], units: Sequence[str] = ()) -> Header:
-    """Header of columns whose names may hold units, as `Time (s)`; units: those said elsewhere."""
+    """Header of columns whose names may hold units, as `Time (s)`; units: stated elsewhere."""
     parted = [split_name(name) for name in names]
     units = units if any(units) else [unit for _, unit in parted]
     return Header(_unique([name for name, _ in parted]), tuple(map(_plain, units)))
@@ -325,8 +326,8 @@ def _step_s(above: Sequence[Sequence[str]]) -> float | None:
     """Time step in s from a preamble, or None."""
     for cells in above:
         if len(cells) > 1 and STEP.fullmatch(cells[0]):
-            said = cells[1].replace(",", ".")
-            return float(said) if re.fullmatch(PLAIN["."], said) else None
+            stated = cells[1].replace(",", ".")
+            return float(stated) if re.fullmatch(PLAIN["."], stated) else None
     return None
 
 
@@ -385,11 +386,11 @@ def _rigol_header(above: Sequence[Sequence[str]], n_columns: int) -> Header | No
     for k, cells in enumerate(above):
         words = [cell.lower() for cell in cells]
         below = dict(zip(words, above[k + 1] if k + 1 < len(above) else [], strict=False))
-        said = below.get("increment", "")
-        if len(words) > n_columns and re.fullmatch(PLAIN["."], said):
+        stated = below.get("increment", "")
+        if len(words) > n_columns and re.fullmatch(PLAIN["."], stated):
             units = [unit if unit_like(unit) else "" for unit in map(_plain, above[k + 1])]
             units += [""] * n_columns
-            return Header(_unique(cells[:n_columns]), tuple(units[:n_columns]), float(said))
+            return Header(_unique(cells[:n_columns]), tuple(units[:n_columns]), float(stated))
     return None
 
 

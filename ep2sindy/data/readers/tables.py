@@ -85,7 +85,7 @@ def text_source(path: Path, file: TextIO) -> FileSource:
 
 
 def _holds_numbers(column: pd.Series) -> bool:
-    """True for a column of numbers that begins beyond the lines that the layout is told from."""
+    """True for a column of numbers that begins beyond the lines that the layout is stated from."""
     return column.dtype.kind in "fiu" and bool(column.notna().any())
 
 
@@ -225,8 +225,8 @@ def read_excel(path: Path) -> FileSource:
         except ValueError as error:
             faults[str(name)] = str(error)
     if not found:
-        said = "; ".join(f"sheet {name!r}: {text}" for name, text in faults.items())
-        raise ValueError(f"no sheet of it holds a table: {said}")
+        stated = "; ".join(f"sheet {name!r}: {text}" for name, text in faults.items())
+        raise ValueError(f"no sheet of it holds a table: {stated}")
     words = [
         f"sheet {name!r}: {source.words.replace(' between tabs', '')}"
         for name, source in found.items()
@@ -318,12 +318,12 @@ def read_tdms(path: Path) -> FileSource:
             for channel in group.channels()
         }
         values = {name: np.asarray(channel[:]) for name, channel in channels.items()}
-        said = {name: dict(channel.properties) for name, channel in channels.items()}
+        stated = {name: dict(channel.properties) for name, channel in channels.items()}
 
     def read(name: str) -> xr.DataArray:
-        return column_array(pd.Series(values[name]), str(said[name].get(UNIT, "")))
+        return column_array(pd.Series(values[name]), str(stated[name].get(UNIT, "")))
 
-    steps = {float(of[STEP]) for of in said.values() if of.get(STEP)}
+    steps = {float(of[STEP]) for of in stated.values() if of.get(STEP)}
     return FileSource(
         path, [*values], read, words=f"{len(values)} channels", is_table=True,
         step_s=steps.pop() if len(steps) == 1 else None,

@@ -31,7 +31,7 @@ class GradientDescent:
 
     optimizer: function from parameters to an optimiser, such as
     `partial(torch.optim.Adam, lr=1e-2)`.
-    The fit has converged when the last `patience` steps reduced the loss by less than a share
+    The fit has converged when the last `patience` steps reduced the loss by less than a fraction
     `tolerance`.
     """
 

@@ -21,7 +21,7 @@ from ep2sindy.refinement.problem import (
 )
 from ep2sindy.refinement.steps import ONE_RUNGE_KUTTA, Step
 
-# Directions of the scalings weaker than this share of the strongest are dropped.
+# Directions of the scalings weaker than this fraction of the strongest are dropped.
 RANK = 1e-12
 
 OVERFLOWING = 1e150  # tangents of this size overflow when they are squared
@@ -42,7 +42,7 @@ JOINING_STEPS = 20  # most steps that close the gaps with the scalings held
 
 JOINED = 1e-10  # largest gap, in std, that need not be closed further
 
-# Gaps below this share of the residuals do not stop a step that gains: they open where
+# Gaps below this fraction of the residuals do not stop a step that gains: they open where
 # trajectories curve, and the next step closes them.
 FINE = 1e-3
 
@@ -63,7 +63,7 @@ class MultipleShooting:
     samples, then `growth` times as many, up to the window's length; the last stages have no pull.
     If a stage does not close the gaps between steps, it is tried again by way of the geometric
     mean of its memory and the last one's.
-    A step must lower the sum of squared residuals plus a price times the gaps; if it does not, it
+    A step must lower the sum of squared residuals plus a penalty times the gaps; if it does not, it
     is undone and the next one is damped (Levenberg-Marquardt), in units of what each scaling
     does to the trajectories. So no iteration leaves the finite numbers.
     Each point has its own steps and leaves once it has converged.
@@ -129,7 +129,7 @@ class _Walk:
     """A fit on its way, whose arrays change in place, with the one-step maps at its nodes.
 
     memory: (points,), the longest one of a stage that left no gaps, at least one sample. damping:
-    (points,), zero for whole Gauss-Newton steps. price: (points,), of the gaps between steps, in
+    (points,), zero for whole Gauss-Newton steps. penalty: (points,), of the gaps between steps, in
     the sum that an iteration must lower.
     """
 
@@ -139,7 +139,7 @@ class _Walk:
         self.scaling, self.nodes = start.scaling.copy(), start.nodes.copy()
         self.weights, self.finished = start.weights, start.finished.copy()
         self.memory = np.ones_like(points) if start.memory is None else start.memory.copy()
-        self.damping, self.price = np.zeros((2, len(points)))
+        self.damping, self.penalty = np.zeros((2, len(points)))
         self.maps = step_maps(problem, start.step, self.scaling, self.nodes, points)
         self.finite = start.finite & np.isfinite(self.maps).all(axis=(1, 2, 3, 4))
 
@@ -175,7 +175,7 @@ class _Walk:
                     self.remember(memory, arrived)
 
     def _by_point(self) -> tuple[np.ndarray, ...]:
-        return self.scaling, self.nodes, self.maps, self.price
+        return self.scaling, self.nodes, self.maps, self.penalty
 
     def note_memory(self, memory: int, points: np.ndarray) -> None:
         """Note this memory at the points that it leaves without gaps."""
@@ -216,12 +216,12 @@ class _Walk:
         maps = self.pull(self._maps_of(active), active, memory)
         scaling, nodes = self.scaling[active], self.nodes[active]
         change, moved = self._newton_step(maps, active, None if hold else damping)
-        share = step_share(moved, problem.ranges[active]) / (1.0 + damping)
-        share = np.nan_to_num(share)
-        change = share[:, None] * change
+        fraction = step_fraction(moved, problem.ranges[active]) / (1.0 + damping)
+        fraction = np.nan_to_num(fraction)
+        change = fraction[:, None] * change
         self.scaling[active] += change
         with np.errstate(invalid="ignore"):  # a step without bounds is undone
-            self.nodes[active] += share[:, None, None, None] * moved
+            self.nodes[active] += fraction[:, None, None, None] * moved
         raw = step_maps(problem, self.step, self.scaling, self.nodes, active, by_scaling=not hold)
         ahead = self.pull(raw, active, memory)
         size, defect = gap_sizes(maps, nodes)
@@ -237,7 +237,7 @@ class _Walk:
         relative = np.abs(change / size).max(axis=1, initial=0.0)
         defect = np.where(better, defect_ahead, defect)
         small = (relative < tolerance) & (defect < tolerance)
-        self.finished[active] = better & (share == 1.0) & small
+        self.finished[active] = better & (fraction == 1.0) & small
         self._tell(memory, active, relative, defect)
         if better.all() and len(active) == len(self.maps):
             self.maps = raw
@@ -274,9 +274,9 @@ class _Walk:
         size: np.ndarray,
         size_ahead: np.ndarray,
     ) -> np.ndarray:
-        """Whether the nodes lower residuals and gaps, (points,), at the price of gaps as it is now.
+        """Whether the nodes lower residuals and gaps, (points,), at the present penalty of gaps.
 
-        size, size_ahead: norm of the gaps before and after. The price is never lowered, and at
+        size, size_ahead: norm of the gaps before and after. The penalty is never lowered, and at
         least twice what closing the gaps will cost.
         """
         problem = self.problem
@@ -286,12 +286,12 @@ class _Walk:
                 squares(x, data, weights) for x in (before, before + moved, self.nodes[active])
             )
             cost = np.where(size > 0.0, 2.0 * (aim - loss) / np.maximum(size, JOINED), 0.0)
-            price = np.maximum(self.price[active], np.where(np.isfinite(cost), cost, 0.0))
-            self.price[active] = price
+            penalty = np.maximum(self.penalty[active], np.where(np.isfinite(cost), cost, 0.0))
+            self.penalty[active] = penalty
             slack = SLACK * loss + ROUNDING * np.sqrt(loss * data[0].size)
             gains = loss_ahead - loss - slack <= 0.0
             fine = size_ahead - FINE * np.sqrt(loss) <= 0.0
-            better: np.ndarray = loss_ahead + price * size_ahead <= loss + price * size + slack
+            better: np.ndarray = loss_ahead + penalty * size_ahead <= loss + penalty * size + slack
         return better | (gains & fine)
 
     def _maps_of(self, points: np.ndarray) -> np.ndarray:
@@ -321,7 +321,7 @@ class _Walk:
 
 
 def _next_damping(damping: np.ndarray, better: np.ndarray, *, hold: bool) -> np.ndarray:
-    """Less after a gain, more without; with the scalings held, only the share of a step counts."""
+    """Less after a gain, more without; with the scalings held, only the step length counts."""
     eased = np.where(damping < NONE, 0.0, LESS * damping)
     return np.where(better, eased, np.maximum(MORE * damping, 1.0 if hold else FIRST_DAMPING))
 
@@ -381,7 +381,7 @@ def gap_sizes(maps: np.ndarray, nodes: np.ndarray) -> tuple[np.ndarray, np.ndarr
         return np.sqrt(np.square(gaps).sum(axis=(1, 2, 3))), gaps.max(axis=(1, 2, 3))
 
 
-def step_share(moved: np.ndarray, ranges: np.ndarray) -> np.ndarray:
+def step_fraction(moved: np.ndarray, ranges: np.ndarray) -> np.ndarray:
     """Largest fraction of a step that moves no node by more than the data's range, (points,)."""
     by_node = (np.abs(moved).max(axis=(1, 2)) / ranges).max(axis=1)
     return 1.0 / np.maximum(1.0, by_node)

@@ -30,18 +30,18 @@ def within_table(T, per_eV, top):
 
 
 @compiled(inline="always")
-def between_rows(table, row, share, column):
+def between_rows(table, row, fraction, column):
     """Linear interpolation between two rows of the closure table."""
     below = table[row, column]
-    return below + share * (table[row + ONE, column] - below)
+    return below + fraction * (table[row + ONE, column] - below)
 
 
 @compiled(inline="always")
-def with_slope(table, row, share, column, per_eV):
+def with_slope(table, row, fraction, column, per_eV):
     """A loss rate in eV m^3/s or eV/s and its slope in T_e; the slope is 0 where the loss falls."""
     below = table[row, column]
     rise = table[row + ONE, column] - below
-    return below + share * rise, max(rise, 0.0) * per_eV
+    return below + fraction * rise, max(rise, 0.0) * per_eV
 
 
 @compiled(**LOOP)
@@ -55,14 +55,16 @@ def by_temperature(T, n, nn, log_n, model, nu, coulomb, ion_loss, wall, wall_slo
     for i in range(T.size):
         place = T[i] * per_eV
         row = np.uint64(place)
-        share = place - row
-        log_lambda = between_rows(table, row, share, COULOMB_LOG) - 0.5 * log_n[i]
-        coulomb[i] = n[i] * between_rows(table, row, share, COULOMB) * log_lambda
-        with_neutrals = nn[i] * between_rows(table, row, share, MOMENTUM)
-        on_wall = model.wall_collision_weight[i] * between_rows(table, row, share, WALL_COLLISION)
+        fraction = place - row
+        log_lambda = between_rows(table, row, fraction, COULOMB_LOG) - 0.5 * log_n[i]
+        coulomb[i] = n[i] * between_rows(table, row, fraction, COULOMB) * log_lambda
+        with_neutrals = nn[i] * between_rows(table, row, fraction, MOMENTUM)
+        on_wall = model.wall_collision_weight[i] * between_rows(
+            table, row, fraction, WALL_COLLISION
+        )
         nu[i] = with_neutrals + coulomb[i] + model.anomalous[i] + on_wall
-        ion_loss[i] = model.wall_ion_weight[i] * between_rows(table, row, share, ION_LOSS)
-        loss, slope = with_slope(table, row, share, WALL_POWER, per_eV)
+        ion_loss[i] = model.wall_ion_weight[i] * between_rows(table, row, fraction, ION_LOSS)
+        loss, slope = with_slope(table, row, fraction, WALL_POWER, per_eV)
         wall[i] = n[i] * model.wall_power_weight[i] * loss
         wall_slope[i] = n[i] * model.wall_power_weight[i] * slope
 
@@ -84,15 +86,15 @@ def by_energy(T, drift, n, nn, model, nu, coulomb, per_nu, per_mobility, kappa, 
     for i in range(T.size):
         place = min((T[i] + weight * drift[i]) * per_eV, top)
         row = np.uint64(place)
-        share = place - row
-        frequency = nu[i] + nn[i] * between_rows(table, row, share, EVENTS)
+        fraction = place - row
+        frequency = nu[i] + nn[i] * between_rows(table, row, fraction, EVENTS)
         squares, hindered = frequency**2 + omega[i] ** 2, frequency + shared * coulomb[i]
         inverse = 1.0 / (frequency * squares * hindered)
         per_nu[i] = inverse * squares * hindered
         per_mobility[i] = squares * per_nu[i] / unit
         kappa[i] = factor * n[i] * T[i] * (frequency**2 * (frequency * inverse))
-        rate[i] = between_rows(table, row, share, IONIZATION)
-        lost, steep = with_slope(table, row, share, INELASTIC, per_eV)
+        rate[i] = between_rows(table, row, fraction, IONIZATION)
+        lost, steep = with_slope(table, row, fraction, INELASTIC, per_eV)
         loss[i], slope[i] = n[i] * nn[i] * lost, n[i] * nn[i] * steep
 
 

@@ -104,25 +104,25 @@ def fluxes_at_ends(n, g, u, c2, bohm, flux, momentum_flux):
 
 
 @compiled(**LOOP)
-def birth(rate, n_e, source, speed, consumed, gain, push, first):
+def birth(rate, n_e, source, speed, consumed, gain, momentum_gain, first):
     """Ions from neutrals, with the neutrals' speed or at rest; if first, forget what was there."""
     keep = 0.0 if first else 1.0
     for i in inside(source):
         born = rate[i] * n_e[i] * source[i]
         consumed[i] = keep * consumed[i] + born
         gain[i] = keep * gain[i] + born
-        push[i] = keep * push[i] + born * speed[i]
+        momentum_gain[i] = keep * momentum_gain[i] + born * speed[i]
 
 
 @compiled(**LOOP)
-def further_birth(rate, n_e, source, g, loss, drag, gain, push):
+def further_birth(rate, n_e, source, g, loss, drag, gain, momentum_gain):
     """Ions from ions of a lower charge, which lose them; they keep their speed."""
     for i in inside(source):
         born, taken = rate[i] * n_e[i] * source[i], rate[i] * n_e[i] * g[i]
         loss[i] -= born
         drag[i] -= taken
         gain[i] += born
-        push[i] += taken
+        momentum_gain[i] += taken
 
 
 @compiled(**FAST)
@@ -131,20 +131,27 @@ def births(n, g, nn, state, model, w):
     n_e = n[0]
     for k in range(1, n.shape[0]):
         w.gain[k] = 0.0
-        w.push[k] = 0.0
+        w.momentum_gain[k] = 0.0
         for i in inside(nn):
             w.n_e[i] = n_e[i] + (k + 1.0) * n[k, i]
         n_e = w.n_e
     rates, speed = state.rates, model.birth_speed
-    birth(rates[0], n_e, nn, speed, w.consumed, w.gain[0], w.push[0], True)
+    birth(rates[0], n_e, nn, speed, w.consumed, w.gain[0], w.momentum_gain[0], True)
     for t in range(model.further.shape[0]):
         below, above = model.further[t, 0] - 1, model.further[t, 1] - 1
-        gain, push = w.gain[above], w.push[above]
+        gain, momentum_gain = w.gain[above], w.momentum_gain[above]
         if below < 0:
-            birth(rates[t + 1], n_e, nn, speed, w.consumed, gain, push, False)
+            birth(rates[t + 1], n_e, nn, speed, w.consumed, gain, momentum_gain, False)
         else:
             further_birth(
-                rates[t + 1], n_e, n[below], g[below], w.gain[below], w.push[below], gain, push
+                rates[t + 1],
+                n_e,
+                n[below],
+                g[below],
+                w.gain[below],
+                w.momentum_gain[below],
+                gain,
+                momentum_gain,
             )
 
 
@@ -164,7 +171,8 @@ def leaving_speed(charge, state, model):
 
 @compiled(**LOOP)
 def follow_ions(
-    new, new_g, new_u, n, g, flux, momentum_flux, gain, push, E, loss, per_before, per_behind,
+    new, new_g, new_u, n, g, flux, momentum_flux, gain, momentum_gain, E, loss, per_before,
+    per_behind,
     neutralised, walled, through, keep, dt, weight, charge, to_wall, c2, first,
 ):  # fmt: skip
     """new = keep new + (1 - keep) (n + dt dn/dt), the same of the ion flux, their ratio, and sums.
@@ -178,7 +186,7 @@ def follow_ions(
         d_n = inflow * before - flux[i] * behind + gain[i] - gone
         widening = c2 * n[i] * (behind - before)  # pressure on the sides of a cell that widens
         d_g = momentum_flux[i - ONE] * before - momentum_flux[i] * behind + widening
-        d_g += push[i] + charge * n[i] * E[i] - lost * g[i]
+        d_g += momentum_gain[i] + charge * n[i] * E[i] - lost * g[i]
         neutralised[i] = others * neutralised[i] + gone
         walled[i] += weight * gone
         through[i] += weight * inflow
@@ -234,7 +242,8 @@ def stage_of_ions(k, new, new_g, n, g, nn, keep, dt, state, model, sums, w):
     fluxes_at_ends(n, g, u, c2, leaving_speed(charge, state, model), flux, w.momentum_flux)
     cells = sums.cells
     follow_ions(
-        new, new_g, u, n, g, flux, w.momentum_flux, w.gain[k], w.push[k], state.E, state.wall_loss,
+        new, new_g, u, n, g, flux, w.momentum_flux, w.gain[k], w.momentum_gain[k], state.E,
+        state.wall_loss,
         model.per_before, model.per_behind, w.neutralised, cells[WALL_LOSS],
         cells[FACE_I + PER_CHARGE * k], keep, dt, weight, charge, np.sqrt(z), c2, k == 0,
     )  # fmt: skip

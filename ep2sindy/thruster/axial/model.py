@@ -119,7 +119,7 @@ def _circuit(thruster: Thruster, point: OperatingPoint, end_s: float) -> dict[st
     if point.supply is not None:
         point.supply.check(point.voltage, end_s)
         n_steps = math.ceil(end_s / SUPPLY_STEP_S)
-        check_memory(8.0 * n_steps, f"duration_s = {end_s:g} s", way_out="simulate less of it")
+        check_memory(8.0 * n_steps, f"duration_s = {end_s:g} s", hint="simulate less of it")
         volts = point.supply.at(SUPPLY_STEP_S * np.arange(n_steps + 2.0), point.voltage)
         rate = 1.0 / SUPPLY_STEP_S
     circuit = thruster.circuit
@@ -253,8 +253,8 @@ class Spreading:
     def follow(self, sample_s: float) -> None:
         """Let the areas follow the plasma by one sample; what a cell holds spreads over them."""
         state, before = self.state, self.model.spread.copy()
-        share = -np.expm1(-sample_s / DELAY_S)
-        state.tangent[:] += share * (self._target() - state.tangent)
+        fraction = -np.expm1(-sample_s / DELAY_S)
+        state.tangent[:] += fraction * (self._target() - state.tangent)
         self._set_areas()
         thinner = before / self.model.spread
         for each in (state.n_i, state.flux_i, state.n_n, state.energy):

@@ -42,7 +42,7 @@ class Settings:
         check_memory(
             32.0 * self.n_cells * (n_samples + MIN_STEPS),  # at least four profiles
             f"duration_s / sample_s = {n_samples:.3g} samples of n_cells = {self.n_cells}",
-            way_out="simulate less of each",
+            hint="simulate less of each",
         )
         if not 0.0 < self.cfl <= 1.0:
             raise ValueError(f"cfl must be above 0 and at most 1, got {self.cfl!r}")

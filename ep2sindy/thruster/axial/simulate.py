@@ -90,7 +90,7 @@ def simulate(
 
     Returns a Dataset on ("time", "z"), time in s from the end of the warm-up, with fields
     (float32) and series (float64); docs/thruster.md lists them. Its attributes hold the
-    parameters as JSON, `initial`, `status` (see `judge_status`; also out and diverged), `cycle`,
+    parameters as JSON, `initial`, `status` (see `assess_status`; also out and diverged), `cycle`,
     `f_kHz`, mean and standard deviation of I_d, thrust, specific impulse and efficiency, and
     `mass_balance` and `energy_balance` (out plus stored over in).
     A diverged run ends at its last finite sample and has that status; it is not an error.

@@ -44,7 +44,7 @@ FIXED = (
 )  # fmt: skip
 
 
-FIRST_SHARES = (0.01, 0.001)  # of the electrons, from ions of charge 2 and 3
+FIRST_FRACTIONS = (0.01, 0.001)  # of the electrons, from ions of charge 2 and 3
 
 
 class Beginning(NamedTuple):
@@ -228,8 +228,8 @@ def _state(
     size, charges = n_n.size, json.loads(parameters)["thruster"]["charge_states"]
     n, g = np.array(n_i), np.array(flux_i)
     if len(n) < charges:  # few electrons come from ions of higher charges
-        shares = np.array(FIRST_SHARES[: charges - 1])
-        given = np.append(1.0 - shares.sum(), shares / np.arange(2.0, charges + 1.0))[:, None]
+        fractions = np.array(FIRST_FRACTIONS[: charges - 1])
+        given = np.append(1.0 - fractions.sum(), fractions / np.arange(2.0, charges + 1.0))[:, None]
         n, g = given * n, given * np.sqrt(np.arange(1.0, charges + 1.0))[:, None] * g
     n_e = n.T @ np.arange(1.0, charges + 1.0)
     zeros = np.zeros((3, size))

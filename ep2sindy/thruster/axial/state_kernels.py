@@ -101,7 +101,7 @@ class AxialModel(NamedTuple):
     drift_weight: float  # 1: rates include the electrons' drift energy; 0: they do not
     drift_credit: bool  # some inelastic events take their energy from it, not from the heat
     sheath: bool  # whether the anode has a sheath; else its temperature is fixed
-    sheath_weight: float  # share of its drop that electrons pay with heat
+    sheath_weight: float  # fraction of its drop that electrons pay with heat
     anode_T_e_eV: float  # eV
     cathode_T_e_eV: float  # eV
     coldest_eV: float  # lower bound of T_e; with one, the energy balance does not close
@@ -154,13 +154,13 @@ class Scratch(NamedTuple):
     """Arrays of the loop that no step needs from the one before."""
 
     u: np.ndarray  # (charges, n + 2), speeds of the ions
-    slope_n: np.ndarray  # (n + 2,), as all that follow but where said; half slopes: of ions,
+    slope_n: np.ndarray  # (n + 2,), as all that follow but where stated; half slopes: of ions,
     slope_u: np.ndarray  # of their speed,
     slope_nn: np.ndarray  # of neutrals
     flux: np.ndarray  # through the face behind each cell
     momentum_flux: np.ndarray
     gain: np.ndarray  # (charges, n + 2): of ions by ionisation, and of their flux
-    push: np.ndarray  # (charges, n + 2)
+    momentum_gain: np.ndarray  # (charges, n + 2)
     consumed: np.ndarray  # neutrals
     neutralised: np.ndarray  # ions at the walls
     n_e: np.ndarray
@@ -194,6 +194,6 @@ class Scratch(NamedTuple):
 
 def new_work(charges: int, size: int) -> Scratch:
     """Zeros for cells, with ghosts, of this number."""
-    per_charge = ("u", "gain", "push", "stage_n", "stage_flux")
+    per_charge = ("u", "gain", "momentum_gain", "stage_n", "stage_flux")
     shapes = {k: (charges, size) if k in per_charge else size for k in Scratch._fields}
     return Scratch(**{k: np.zeros(shape) for k, shape in shapes.items()})

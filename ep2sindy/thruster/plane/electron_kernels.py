@@ -74,27 +74,27 @@ def collisions(state, model, columns):
         if not (x >= 0.0 and y < top and n > 0.0):
             return False
         row, hot = np.uint64(x), np.uint64(y)
-        share, hot_share = x - row, y - hot
+        fraction, hot_fraction = x - row, y - hot
         neutrals, ions = columns.n_neutrals[i] / n, columns.n_n[i] / n
         walls = state.wall[i] / n  # 1/s
-        log_lambda = between_rows(table, row, share, COULOMB_LOG) - 0.5 * np.log(ions)
+        log_lambda = between_rows(table, row, fraction, COULOMB_LOG) - 0.5 * np.log(ions)
         nu = (
-            neutrals * between_rows(table, row, share, MOMENTUM)
-            + neutrals * between_rows(table, hot, hot_share, EVENTS)
-            + ions * log_lambda * between_rows(table, row, share, COULOMB)
-            + walls * between_rows(table, hot, hot_share, WALL_COLLISION)
+            neutrals * between_rows(table, row, fraction, MOMENTUM)
+            + neutrals * between_rows(table, hot, hot_fraction, EVENTS)
+            + ions * log_lambda * between_rows(table, row, fraction, COULOMB)
+            + walls * between_rows(table, hot, hot_fraction, WALL_COLLISION)
             + model.anomalous[i]
         )
         columns.nu[i] = nu
         columns.conductance[i] = E_CHARGE / M_ELECTRON * nu / (nu**2 + model.omega_ce[i] ** 2) * n
-        columns.loss[i] = columns.n_neutrals[i] * between_rows(table, hot, hot_share, INELASTIC)
-        columns.loss[i] += state.wall[i] * between_rows(table, hot, hot_share, WALL_POWER)
+        columns.loss[i] = columns.n_neutrals[i] * between_rows(table, hot, hot_fraction, INELASTIC)
+        columns.loss[i] += state.wall[i] * between_rows(table, hot, hot_fraction, WALL_POWER)
         columns.loss[i] += state.side[i] * SIDE_ENERGY * state.T_e_eV[i]
         inelastic = table[hot + ONE, INELASTIC] - table[hot, INELASTIC]
         wall = table[hot + ONE, WALL_POWER] - table[hot, WALL_POWER]
         slope = columns.n_neutrals[i] * inelastic + state.wall[i] * wall
         columns.loss_slope[i] = max(slope * per_eV, 0.0) + state.side[i] * SIDE_ENERGY
-        state.ionization[i] = between_rows(table, hot, hot_share, IONIZATION)
+        state.ionization[i] = between_rows(table, hot, hot_fraction, IONIZATION)
     return True
 
 

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 
 from ep2sindy.thruster.parameters import Thruster
 
-CHANNEL_SHARE = 25 / 49  # share of the rows in the channel
+CHANNEL_FRACTION = 25 / 49  # fraction of the rows in the channel
 MIN_CELLS = 10
 
 
@@ -49,7 +49,7 @@ class MaskedGrid:
     @property
     def n_side(self) -> int:
         """Rows of the plume on either side of the channel's rows."""
-        return round(self.n_r * (1.0 - CHANNEL_SHARE) / 2.0)
+        return round(self.n_r * (1.0 - CHANNEL_FRACTION) / 2.0)
 
     @property
     def dr(self) -> float:

@@ -212,11 +212,15 @@ def update(here, new, E, before, behind, radial, start, stop, c2, rate, old, dt,
     for j in range(start, stop):
         m, n, per = j + ONE, here.n[j], per_area[j]
         born = rate * n * here.neutrals[j]
-        push_z = charge * n * E[j] + born * slow
-        push_r = c2 * n * (size[m] - size[j]) + radial.r[j] - radial.r[m]
+        momentum_gain_z = charge * n * E[j] + born * slow
+        momentum_gain_r = c2 * n * (size[m] - size[j]) + radial.r[j] - radial.r[m]
         d_n = (before.n[j] - behind.n[j]) * per_dz + (radial.n[j] - radial.n[m]) * per + born
-        d_z = (before.z[j] - behind.z[j]) * per_dz + (radial.z[j] - radial.z[m]) * per + push_z
-        d_r = (before.r[j] - behind.r[j]) * per_dz + push_r * per
+        d_z = (
+            (before.z[j] - behind.z[j]) * per_dz
+            + (radial.z[j] - radial.z[m]) * per
+            + momentum_gain_z
+        )
+        d_r = (before.r[j] - behind.r[j]) * per_dz + momentum_gain_r * per
         d_nn = (before.neutrals[j] - behind.neutrals[j]) * per_dz - born
         d_nn += (radial.neutrals[j] - radial.neutrals[m]) * per
         next_n = old * new.n[j] + fresh * (n + dt * d_n)

@@ -56,26 +56,26 @@ def count_heavy(state, model):
 
 
 @compiled(**LOOP)
-def add_column(sum_n, sum_nn, sum_z, sum_r, here, start, stop, share):
+def add_column(sum_n, sum_nn, sum_z, sum_r, here, start, stop, fraction):
     for j in range(start, stop):
-        sum_n[j] += share * here.n[j]
-        sum_nn[j] += share * here.neutrals[j]
-        sum_z[j] += share * here.u_z[j]
-        sum_r[j] += share * here.u_r[j]
+        sum_n[j] += fraction * here.n[j]
+        sum_nn[j] += fraction * here.neutrals[j]
+        sum_z[j] += fraction * here.u_z[j]
+        sum_r[j] += fraction * here.u_r[j]
 
 
 @compiled(**ENTRY)
-def add(state, model, share, planes, profiles, numbers):
-    """Add a share of the state to the sample: fields, profiles along z, current and thrust."""
+def add(state, model, fraction, planes, profiles, numbers):
+    """Add a fraction of the state to the sample: fields, profiles along z, current and thrust."""
     n, nn, u_z, u_r = planes[0], planes[1], planes[2], planes[3]
     for i in range(state.T_e_eV.size):
         start, stop = model.lower[i], model.upper[i]
-        add_column(n[i], nn[i], u_z[i], u_r[i], column(state.gas, i), start, stop, share)
-        profiles[0, i] += share * state.T_e_eV[i]
-        profiles[1, i] += share * state.ionization[i]
-        profiles[2, i] += share * state.reference_field[i]
-    numbers[0] += share * state.current[0]
-    numbers[1] += share * thrust(state, model)
+        add_column(n[i], nn[i], u_z[i], u_r[i], column(state.gas, i), start, stop, fraction)
+        profiles[0, i] += fraction * state.T_e_eV[i]
+        profiles[1, i] += fraction * state.ionization[i]
+        profiles[2, i] += fraction * state.reference_field[i]
+    numbers[0] += fraction * state.current[0]
+    numbers[1] += fraction * thrust(state, model)
 
 
 @compiled(**ENTRY)

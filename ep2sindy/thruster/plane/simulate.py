@@ -123,8 +123,8 @@ def simulate_as(
     model = build_model(thruster, operating_point, grid)
     n_warm_up, n_samples = round(warm_up_s / sample_s), round(duration_s / sample_s) + 1
     watch = as_progress(progress)
-    with watch.stage(n_warm_up + n_samples, "sample", operating_point.label) as told:
-        rows = warmed_up_run(grid, model, n_warm_up, n_samples, sample_s, averaged, told)
+    with watch.stage(n_warm_up + n_samples, "sample", operating_point.label) as stated:
+        rows = warmed_up_run(grid, model, n_warm_up, n_samples, sample_s, averaged, stated)
     field = labelled(rows, sample_s, grid)
     drop = thruster.series_resistance * field["I_d"].values
     field["V_d"] = ("time", operating_point.voltage - drop, notes(*SERIES["V_d"]))
@@ -178,16 +178,18 @@ def warmed_up_run(
     n_samples: int,
     sample_s: float,
     averaged: bool,
-    told: Advance,
+    stated: Advance,
 ) -> Rows:
     """The samples after the warm-up; if the warm-up diverges, its last finite samples."""
     state = initial_state(grid, model)
     rows = Rows.room(min(n_warm_up, CHUNK_ROWS), grid)
-    broken = warm_up(rows.march(state, model, sample_s, averaged), n_warm_up, told)
+    broken = warm_up(rows.march(state, model, sample_s, averaged), n_warm_up, stated)
     if broken is not None:
         return rows.until(broken)
     rows = Rows.room(n_samples, grid)
-    return rows.until(record_samples(rows.march(state, model, sample_s, averaged), n_samples, told))
+    return rows.until(
+        record_samples(rows.march(state, model, sample_s, averaged), n_samples, stated)
+    )
 
 
 def labelled(rows: Rows, sample_s: float, grid: MaskedGrid) -> xr.Dataset:

@@ -1,4 +1,4 @@
-"""The search for a living model in noise: when it sees a record's mean cycle, and says so."""
+"""The search for a self-sustained model in noise, from a mean cycle where it reports so."""
 
 from dataclasses import replace
 
@@ -6,22 +6,22 @@ import numpy as np
 import pytest
 
 import ep2sindy as ep
-from ep2sindy.studies.living import LivingSearch
+from ep2sindy.studies.sustained import SustainedSearch
 
-SETTINGS = LivingSearch(
+SETTINGS = SustainedSearch(
     ep.BestSubset(max_terms=3, n_best=2), 2, ep.FreeRunScore(), degree=3, noise_limit=0.3
 )
 ROWS = ep.Regression(ep.Differential(), bootstraps=ep.Bootstraps(n=0))
 
 
 def record(noise: float) -> ep.Trajectory:
-    """A Van der Pol oscillator over twelve periods; noise in shares of each state's RMS."""
+    """A Van der Pol oscillator over twelve periods; noise in fractions of each state's RMS."""
     van_der_pol = replace(ep.systems.van_der_pol(), duration_s=120.0, rate_Hz=10.0)
     run = van_der_pol.trajectory(noise=noise, rng=1)
     return run.window(200, run.n_samples)
 
 
-def searched(run: ep.Trajectory, settings: LivingSearch) -> ep.Discovery:
+def searched(run: ep.Trajectory, settings: SustainedSearch) -> ep.Discovery:
     library = ep.polynomial(run.state_names, degree=3)
     return settings.found(run, library, ROWS, rng=np.random.default_rng(0))
 

@@ -145,11 +145,11 @@ def test_a_line_in_what_is_left_beside_a_path_is_a_misfit(memory: float) -> None
 def test_a_library_of_too_low_a_degree_is_no_late_sensor(duration_s: float, align: bool) -> None:
     run, system = lacking(duration_s)
     found = ep.estimate([run], ep.polynomial(["x", "y"], degree=2), align=align)
-    assert found.misfit
+    assert found.lack_of_fit
     assert found.model.covariance is None
     assert not found.delays_s.any()
     right = ep.estimate([run], ep.polynomial(["x", "y"], degree=3), align=align)
-    assert not right.misfit
+    assert not right.lack_of_fit
     np.testing.assert_array_equal(right.model.coef != 0.0, system.model.coef != 0.0)
 
 
@@ -172,7 +172,7 @@ def test_a_delay_at_three_standard_errors_is_none() -> None:
     """The likeliest of two delays, one sample at three standard errors, is what noise shows."""
     system, run = noisy("brusselator", 0.2, 12)
     found = ep.estimate([run], system.model.library)
-    assert not found.misfit
+    assert not found.lack_of_fit
     np.testing.assert_array_equal(found.model.coef != 0.0, system.model.coef != 0.0)
 
 
@@ -219,7 +219,7 @@ def on_a_circle(law: dict[str, dict[str, float]]) -> TrajectoryFit:
     [
         ({"x": {"y": 1.0}, "y": {"x": -1.0}}, True),
         ({"x": {"y": 1.0}, "y": {"x": -1.0, "y": 0.2}}, False),  # grows, by e^6
-        ({"x": {"y": 1.0}, "y": {"x": -1.0, "y": -0.2}}, False),  # dies out
+        ({"x": {"y": 1.0}, "y": {"x": -1.0, "y": -0.2}}, False),  # decays
         ({"x": {"y": 2.0}, "y": {"x": -2.0}}, False),  # turns twice as often
     ],
 )
@@ -236,16 +236,16 @@ def test_process_noise_may_keep_up_what_would_die_out() -> None:
     law = {"x": {"y": 1.0}, "y": {"x": -1.0, "y": -0.2}}
     fit, small = on_a_circle(law), np.full(2, 1e-5)
     # The variance of a damped oscillator under noise: q^2 / (2 * 0.1) per unit of time, about one.
-    pushed = np.full(2, np.sqrt(0.2 * 0.3))
-    assert try_open_loop(fit, np.full(2, 0.01), pushed, start=small).passes.all()
+    with_process_noise = np.full(2, np.sqrt(0.2 * 0.3))
+    assert try_open_loop(fit, np.full(2, 0.01), with_process_noise, start=small).passes.all()
 
 
 def test_a_delay_is_told_with_its_error() -> None:
     run = spoilt("lotka_volterra", "lag 2", 0, 0.02)[1]
     found = ep.estimate([run], ep.polynomial(["x", "y"], degree=2))
-    told = re.search(r"y comes \S+ s late \((\S+) ± (\S+) samples\)", found.misfit)
-    assert told is not None
-    assert abs(float(told[1]) - 2.0) < 2.0 * float(told[2])
+    stated = re.search(r"y comes \S+ s late \((\S+) ± (\S+) samples\)", found.lack_of_fit)
+    assert stated is not None
+    assert abs(float(stated[1]) - 2.0) < 2.0 * float(stated[2])
 
 
 @pytest.mark.slow
@@ -253,6 +253,6 @@ def test_samples_that_one_degree_more_explains_name_the_next_command() -> None:
     """Coarse samples of the Brusselator: false terms and a little process noise follow them."""
     run = chemical(0, n=120)
     found = ep.discover(run)
-    assert "ep.polynomial(['x', 'y'], degree=3)" in found.misfit
-    assert "libraries.model.degree=3" in found.misfit
+    assert "ep.polynomial(['x', 'y'], degree=3)" in found.lack_of_fit
+    assert "libraries.model.degree=3" in found.lack_of_fit
     assert found.model.covariance is None

@@ -1,4 +1,4 @@
-"""`ep2sindy warm`: compile every kernel once, so that no run waits for compilation.
+"""`ep2sindy precompile`: compile every kernel once, so that no run waits for compilation.
 
 Runs of the command line begin with it; once it is done, it takes no time.
 """
@@ -38,14 +38,14 @@ Runs of the command line do so by themselves; in Python, a call compiles what it
 
 def main(arguments: Sequence[str]) -> None:
     """Compile, and report where the kernels are kept."""
-    parser = argparse.ArgumentParser("ep2sindy warm", description=ABOUT)
+    parser = argparse.ArgumentParser("ep2sindy precompile", description=ABOUT)
     parser.add_argument(
         "--shared", action="store_true", help="keep them beside the package, for all users"
     )
     given = parser.parse_args(arguments)
     try:
         stamp = _stamp()
-        warm()
+        precompile()
         if given.shared:
             SHARED.mkdir(parents=True, exist_ok=True)
             for folder in filter(Path.exists, (*folders(), stamp)):
@@ -56,7 +56,7 @@ def main(arguments: Sequence[str]) -> None:
     say(f"all kernels are compiled; they are kept in {place}")
 
 
-def warm() -> None:
+def precompile() -> None:
     """Compile all kernels with a message, unless this machine has compiled these sources."""
     try:
         stamp = _stamp()
@@ -107,7 +107,7 @@ def _search() -> None:
     oscillator = ep.systems.van_der_pol(mu=2.0).model
     cycle = ep.model.limit_cycle(oscillator, np.array([2.0, 0.0]), period_s=7.63)
     assert cycle is not None
-    ep.model.share_reaching(oscillator, cycle, n_starts=1)
+    ep.model.basin_stability(oscillator, cycle, n_starts=1)
 
 
 def _refinement() -> None:

@@ -104,7 +104,7 @@ def test_blocks_give_the_verdict_of_the_whole_record(
     monkeypatch.setattr(choice, "BLOCK", run.n_samples // 8)
     method = ep.Regression(ep.Weak(), ep.BestSubset(max_terms=3))
     blocks = ep.discover(run, library, method=method, seed=0)
-    assert bool(whole.misfit) == bool(blocks.misfit) == (not right)
+    assert bool(whole.lack_of_fit) == bool(blocks.lack_of_fit) == (not right)
 
 
 def test_the_change_point_is_the_corner_of_least_squares() -> None:

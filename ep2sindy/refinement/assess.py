@@ -18,7 +18,7 @@ from ep2sindy.refinement.problem import Method, RefinementFit, RefinementProblem
 from ep2sindy.refinement.steps import integrate
 from ep2sindy.refinement.windows import WindowBatch
 
-FLAT = 0.95  # a model with more than this share of a constant's loss does not follow the data
+FLAT = 0.95  # a model with more than this fraction of a constant's loss does not follow the data
 
 WIDE = 0.5  # relative standard error at which the 95 % interval of a coefficient reaches zero
 
@@ -27,11 +27,11 @@ CLOSED = 1e-9  # largest gap, in std, between the steps of one trajectory
 CLOSING_STEPS = 10  # largest number of Newton steps to close the gaps
 
 # A step counts as fine enough if the bias that it causes in a scaling is below the larger of these:
-# a share of the standard error, and a share of the scaling.
+# a fraction of the standard error, and a fraction of the scaling.
 BIAS_PER_ERROR, MIN_BIAS = 0.1, 1e-4
 
 # A fit counts as stationary if one more Gauss-Newton step would reduce the loss by less than this
-# share, or change no scaling by more.
+# fraction, or change no scaling by more.
 STATIONARY = 1e-3
 
 # Independent windows per scaling that a sandwich covariance needs.
@@ -87,7 +87,7 @@ class RefinementVerdict:
 
     window_loss: mean square of (trajectory - data) / std in each window. covariance,
     covariance_naive: covariances of the scalings. explains: (n_states,), whether the residuals are
-    noise; else intervals would tell how far another stretch of the record moves a wrong model.
+    noise; else intervals would tell how far another segment of the record moves a wrong model.
     """
 
     status: RefinementStatus
@@ -97,23 +97,23 @@ class RefinementVerdict:
     explains: Bool[np.ndarray, " n_states"]
 
 
-def fit_and_judge(
+def fit_and_assess(
     problem: RefinementProblem, method: Method
 ) -> tuple[RefinementFit, list[RefinementVerdict]]:
-    """Fit, halving the time step as long as necessary, and judge the integrated trajectories.
+    """Fit, halving the time step as long as necessary, and assess the integrated trajectories.
 
     Returns the fit, and a verdict for each point.
     """
-    fit, verdicts = judge(problem, method.fit(problem))
+    fit, verdicts = assess(problem, method.fit(problem))
     while any(coarse := [v.status is RefinementStatus.COARSE_STEP for v in verdicts]):
         again = method.finer(problem, fit, np.flatnonzero(coarse))
         if again is None:
             break
-        fit, verdicts = judge(problem, again)
+        fit, verdicts = assess(problem, again)
     return fit, verdicts
 
 
-def judge(
+def assess(
     problem: RefinementProblem, fit: RefinementFit
 ) -> tuple[RefinementFit, list[RefinementVerdict]]:
     """Integrate the fit again, and return it with a verdict on each point."""
@@ -130,11 +130,11 @@ def judge(
     for p, equations in enumerate(problem.equations):
         n_free = equations.n_free
         rows = triangles[p][..., np.append(np.arange(n_free), -1)]
-        verdicts.append(_judge_point(problem, fit, p, rows, bias[p, :n_free], change[p, :n_free]))
+        verdicts.append(_assess_point(problem, fit, p, rows, bias[p, :n_free], change[p, :n_free]))
     return fit, verdicts
 
 
-def _judge_point(
+def _assess_point(
     problem: RefinementProblem,
     fit: RefinementFit,
     point: int,
@@ -248,7 +248,7 @@ def failure(
         return ""
     batch, window = problem.batches[point], fit.nodes.shape[2]
     where = int(np.argmax(np.nan_to_num(verdict.window_loss, nan=np.inf, posinf=np.inf)))
-    how = f"misses its data most, with a loss of {verdict.window_loss[where]:.3g}"
+    how = f"deviates from its data most, with a loss of {verdict.window_loss[where]:.3g}"
     if verdict.status is RefinementStatus.NON_FINITE:
         alone, at = problem.take(point), [point]
         scaling, nodes = fit.scaling[at, : alone.n_free], fit.nodes[at]
@@ -289,9 +289,9 @@ def is_stationary(
     scalings in that step.
     """
     gain = np.square(rows[..., :-1] @ change).sum()
-    share = gain / max(np.square(rows[..., -1]).sum(), 1e-300)
+    fraction = gain / max(np.square(rows[..., -1]).sum(), 1e-300)
     relative = np.abs(change / scaling).max() if scaling.all() else np.inf
-    return bool(min(share, relative) < STATIONARY)
+    return bool(min(fraction, relative) < STATIONARY)
 
 
 def is_coarse(bias: np.ndarray, error: np.ndarray, scaling: np.ndarray) -> bool:
@@ -312,11 +312,10 @@ def covariances(
     holds the residual that no change of the scalings can reduce.
     The residuals of a cluster are those of a fit to the other clusters (CR3, the jackknife). The
     covariance is widened by the quantile of Student's t for their number. Overlapping windows
-    share noise, so their scores are correlated, with weights that fall with distance. With too few
-    windows for a sandwich, the naive covariance replaces it.
-    n_residuals: number of residuals minus the number of starts and scalings.
-    Source: Bell & McCaffrey 2002, Surv. Methodol. 28, 169; Newey & West 1987,
-    doi:10.2307/1913610 for the weights.
+    fraction noise, so their scores are correlated, with weights that fall with distance. With too
+    few windows for a sandwich, the naive covariance replaces it. n_residuals: number of residuals
+    minus the number of starts and scalings. Source: Bell & McCaffrey 2002, Surv. Methodol. 28, 169;
+    Newey & West 1987, doi:10.2307/1913610 for the weights.
     """
     jacobian, z = triangles[:, :-1, :-1], triangles[:, :-1, -1]
     n_windows, n_rows, n_free = jacobian.shape

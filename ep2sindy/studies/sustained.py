@@ -1,7 +1,7 @@
-"""A closed living model, found by free runs in one part of a record and tested on the rest.
+"""A closed self-sustained model, found by free runs in one part of a record and tested on the rest.
 
-A living model is one that keeps oscillating on its own. The module also holds its section of a
-report.
+A self-sustained model is one that keeps oscillating on its own. The module also holds its section
+of a report.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.method import Regression
 from ep2sindy.discovery.result import Discovery
-from ep2sindy.figures import living as figures
+from ep2sindy.figures import free_run as figures
 from ep2sindy.forecasting.evaluation import Evaluation, evaluate
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.library.roles import Roles
@@ -34,7 +34,7 @@ from ep2sindy.selection.criteria import OtherSystem, Selection
 from ep2sindy.signals.attractor import find_cycle, mean_cycle, white_variance
 from ep2sindy.signals.smoothers import KalmanSmoother
 from ep2sindy.signals.spectrum import power_spectrum, samples_in_periods
-from ep2sindy.studies.processes import NO_ZONES, TELLING, Zones, told_roles
+from ep2sindy.studies.processes import NO_ZONES, TELLING, Zones, stated_roles
 from ep2sindy.studies.study import Count, Positive
 from ep2sindy.studies.views import CYCLE, add_samples, terms_text
 
@@ -54,14 +54,15 @@ SPREAD_NOTE = (
 MOST_OTHERS = 12  # shown on the page
 OTHERS_NOTE = (
     "Largest errors over the parts of the record that a model was not fitted to; deviation: the "
-    "largest of the three in units of the bounds of a model that lives. All stay within them: what "
+    "largest of the three in units of the bounds of a self-sustained model. All stay within "
+    "them: what "
     "these models have in common is what the record tells."
 )
 
 
 @dataclass(frozen=True)
-class LivingSearch:
-    """How a library without inputs is searched for a model that lives.
+class SustainedSearch:
+    """How a library without inputs is searched for a self-sustained model.
 
     depth: number of candidates per size, and equation if there are no roles. roles: of terms, for
     equations that conserve what states exchange; None leaves every term free. degree: of a library
@@ -80,7 +81,8 @@ class LivingSearch:
     def __post_init__(self) -> None:
         if self.selection.basis != "runs":
             raise ValueError(
-                "whether a model sustains its oscillation shows when it runs: selection must be a rule that runs models, "
+                "whether a model sustains its oscillation shows when it runs: selection must be "
+                "a rule that runs models, "
                 f"such as FreeRunScore(), got {self.selection!r}"
             )
 
@@ -101,28 +103,29 @@ class LivingSearch:
         """
         own = replace(rows, search=self.search, depth=self.depth, selection=self.selection)
         library = polynomial(train.state_names, degree=self.degree) if self.degree else library
-        roles, told = self._told(train, zones)
+        roles, stated = self._stated(train, zones)
         seen, words = self._quiet(train)
         found = discover(seen, library.with_roles(roles), own, seed=rng, progress=progress)
-        found = replace(found, note=f"{found.note}{told}")
+        found = replace(found, note=f"{found.note}{stated}")
         if not words:
             return found
         # The noise is gone from the samples, and with it what intervals are made of.
         model = replace(found.model, covariance=None)
         return replace(found, model=model, note=f"{words}{found.note}")
 
-    def _told(self, train: Trajectory, zones: Zones) -> tuple[Roles | None, str]:
+    def _stated(self, train: Trajectory, zones: Zones) -> tuple[Roles | None, str]:
         """The roles with what the record tells, and how well it tells what is fitted to it."""
         if self.roles is None:
             return None, ""
         roles = self.roles.in_zones(zones.sizes) if zones.sizes else self.roles
-        told = told_roles(zones.balances, train)
-        fitted = [role for role in roles.open if role in told and role in TELLING]
-        known = {name: role.terms for name, role in told.items()}
+        stated = stated_roles(zones.balances, train)
+        fitted = [role for role in roles.open if role in stated and role in TELLING]
+        known = {name: role.terms for name, role in stated.items()}
         words = (
-            f"{name} by {', '.join(told[name].terms)} (R2 {told[name].r2:.3f})" for name in fitted
+            f"{name} by {', '.join(stated[name].terms)} (R2 {stated[name].r2:.3f})"
+            for name in fitted
         )
-        return roles.with_known(known), f"; told: {', '.join(words)}" if fitted else ""
+        return roles.with_known(known), f"; stated: {', '.join(words)}" if fitted else ""
 
     def _quiet(self, train: Trajectory) -> tuple[Trajectory, str]:
         """What the search sees of a record, and why, if that is its mean cycle."""
@@ -140,12 +143,12 @@ class LivingSearch:
 
     @property
     def bounds(self) -> FreeRunBounds:
-        """The bounds by which the selection rule calls a model living, or the usual ones."""
+        """The bounds by which the selection rule calls a model sustained, or the usual ones."""
         return getattr(self.selection, "bounds", None) or FreeRunBounds()
 
 
 @dataclass(frozen=True, eq=False)
-class Living:
+class SustainedModel:
     """A closed model that was searched for by free runs, and its run over the held-out part.
 
     run: starts at the first held-out sample, smoothed by a Kalman smoother so that the sample's
@@ -163,12 +166,12 @@ class Living:
         return self.discovery.model
 
 
-LIVING: Metrics[Living] = [
+SUSTAINED_MODEL: Metrics[SustainedModel] = [
     Metric("n_terms", lambda found: int(np.count_nonzero(found.model.coef))),
     *(metric.of(lambda found: found.run) for metric in CYCLE),
     Metric("proved", lambda found: "; ".join(consequences(found.model))),
     Metric("selection", lambda found: found.discovery.note),
-    Metric("misfit", lambda found: found.discovery.misfit),
+    Metric("lack_of_fit", lambda found: found.discovery.lack_of_fit),
     Metric("refinement_by_derivatives", lambda found: found.refinement),
 ]
 OTHERS: Metrics[OtherSystem] = [
@@ -180,7 +183,7 @@ OTHERS: Metrics[OtherSystem] = [
 ]
 
 
-def add_living(report: Report, name: str, found: Living) -> None:
+def add_sustained(report: Report, name: str, found: SustainedModel) -> None:
     """Add the model, how it runs, and how the choice of derivatives does; name: of the library."""
     model, clock, run = found.model, found.run.rollout.clock, found.run
     held_to = found.discovery.constraint
@@ -211,23 +214,23 @@ def add_cycle(report: Report, name: str, run: Evaluation) -> None:
 
 
 def _add_others(report: Report, name: str, others: Sequence[OtherSystem]) -> None:
-    """Add the other systems of this size that live: whether the found one is the law."""
+    """Add the other self-sustained systems of this size: whether the found one is the law."""
     if not others:
         return
     more = f"; the first {MOST_OTHERS} of {len(others)}" if len(others) > MOST_OTHERS else ""
-    title = f"other models of as many coefficients that live where not fitted{more}"
+    title = f"other models of as many coefficients that are sustained where not fitted{more}"
     rows = ResultTable(others[:MOST_OTHERS], OTHERS).screen()
     shown = Table(rows, title=title, note=OTHERS_NOTE, page_only=True)
     report.table(f"living_others_{name}", ResultTable(others, OTHERS), shown=shown)
 
 
-def _notes(found: Living) -> list[str]:
+def _notes(found: SustainedModel) -> list[str]:
     """On the selection, the stability, and the equations selected by derivatives."""
     proved = consequences(found.model)
     notes = [f"By its terms {'; '.join(proved)}."] if proved else []
     notes.append(f"Selection: {found.discovery.note}.")
     notes += [found.run.cycle_text] if found.run.cycle_text else []
-    notes += [f"Misfit: {found.discovery.misfit}."] if found.discovery.misfit else []
+    notes += [f"Lack of fit: {found.discovery.lack_of_fit}."] if found.discovery.lack_of_fit else []
     text = "; ".join(found.refined.model.text().splitlines())
     refined = f"refined as they are ({found.refinement})"
     if found.refinement == "non_finite":
@@ -235,19 +238,19 @@ def _notes(found: Living) -> list[str]:
     return [" ".join(notes), f"The equations selected by their derivatives, {refined}: {text}."]
 
 
-def living_model(
+def sustained_model(
     train: Trajectory,
     held: Trajectory,
     library: Library,
     rows: Regression,
-    settings: LivingSearch,
+    settings: SustainedSearch,
     selected: SparseModel,
     zones: Zones,
     *,
     rng: np.random.Generator,
     progress: Progress = SILENT,
-) -> Living:
-    """Find a living model in one part of a record, and run it over the other.
+) -> SustainedModel:
+    """Find a self-sustained model in one part of a record, and run it over the other.
 
     selected: the model selected by derivatives, which is refined for comparison, on windows of two
     periods if the record has a period.
@@ -260,7 +263,7 @@ def living_model(
         run = evaluate(found.model, held, initial=start, bounds=settings.bounds)
     refined = refine(selected, [train], window=two_periods(train), seed=0, progress=progress)
     own = evaluate(refined.model, held, initial=start_of(held, selected))
-    return Living(found, run, own, refined.status)
+    return SustainedModel(found, run, own, refined.status)
 
 
 def start_of(run: Trajectory, model: SparseModel) -> np.ndarray:

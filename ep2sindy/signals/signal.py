@@ -20,20 +20,20 @@ from ep2sindy.signals.spectrum import (
     power_spectrum,
 )
 
-MIN_PERIODS = 6.0  # fewest periods in a record on which a free run can be judged
+MIN_PERIODS = 6.0  # fewest periods in a record on which a free run can be assessed
 
 # Fewest samples per period: three harmonics. A signal that is sampled more rarely is aliased.
 MIN_SAMPLES = 6.0
 
-# Least standard deviation of the waveform, as a share of the signal's, if there is a cycle. A cycle
-# found in white noise also has some.
+# Least standard deviation of the waveform, as a fraction of the signal's, if there is a cycle. A
+# cycle found in white noise also has some.
 MIN_VISIBLE = 0.5
 
-# Share of white noise in the variance from which a signal without a cycle is taken for noise.
+# Fraction of white noise in the variance from which a signal without a cycle is taken for noise.
 ALL_NOISE = 0.7
 
-# A drift counts if it is certain, in standard errors, and large: as a share of the level that nine
-# of ten samples of a positive signal exceed, or of the standard deviation of any other.
+# A drift counts if it is certain, in standard errors, and large: as a fraction of the level that
+# nine of ten samples of a positive signal exceed, or of the standard deviation of any other.
 CERTAIN, DRIFT = 5.0, 0.1
 
 # Most digits of times that count as rounded, and how far off a rounded time may be, in units of its
@@ -43,12 +43,12 @@ MOST_DIGITS, ROUNDED = 9, 0.8
 JITTER = 0.02  # largest deviation from even times, in steps, that changes nothing
 
 # Limits for a signal that is positive apart from noise: how far a sample may lie below zero, in
-# standard deviations of the noise, and the share of samples that may.
-NOISE_BELOW, SHARE_BELOW = 6.0, 0.05
+# standard deviations of the noise, and the fraction of samples that may.
+NOISE_BELOW, FRACTION_BELOW = 6.0, 0.05
 
 
 @dataclass(frozen=True, eq=False)
-class Trace:
+class Signal:
     """An oscillating signal of at least six periods.
 
     run: the signal as a run of one state, with the inputs that drive it. frequency_Hz: of its
@@ -88,7 +88,7 @@ class Trace:
     def period_s(self) -> float:
         return 1.0 / self.frequency_Hz
 
-    def window(self, start: int, stop: int) -> Trace:
+    def window(self, start: int, stop: int) -> Signal:
         """Samples from `start` to `stop` (exclusive), with the frequency of the whole."""
         return replace(self, run=self.run.window(start, stop), done=(), advice=())
 
@@ -117,7 +117,7 @@ def prepare_signal(
     *,
     decimate: int | str | None = "auto",
     detrend: bool | str = "auto",
-) -> Trace:
+) -> Signal:
     """Make a trace of one variable of a run.
 
     run: as `discover` takes it; its inputs stay beside the signal. signal: None takes the only
@@ -160,7 +160,7 @@ def prepare_signal(
     frequency_Hz = crossing_frequency(t, x) if cycle is None else cycle.frequency_Hz
     own = replace(own, states=x[:, None])
     done = (*evened, *straightened, *averaged)
-    found = Trace(own, frequency_Hz, cycle, done, drifting)
+    found = Signal(own, frequency_Hz, cycle, done, drifting)
     _check_oscillation(found)
     return found
 
@@ -172,7 +172,7 @@ def is_positive(t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samples
         return True
     noise = float(np.sqrt(white_variance(*power_spectrum(t, x))))
     explained = noise > 1e-3 * x.std() and lowest > -NOISE_BELOW * noise
-    return bool(explained and x.mean() > 0.0 and (x <= 0.0).mean() <= SHARE_BELOW)
+    return bool(explained and x.mean() > 0.0 and (x <= 0.0).mean() <= FRACTION_BELOW)
 
 
 def _restore_even_times(t: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
@@ -193,7 +193,7 @@ def _restore_even_times(t: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
     return t, ()
 
 
-def _check_oscillation(signal: Trace) -> None:
+def _check_oscillation(signal: Signal) -> None:
     """Raise ValueError for a signal that does not oscillate, or not often or not finely enough."""
     name, clock = signal.name, signal.clock
     duration = clock.duration_text(float(signal.t[-1] - signal.t[0]), digits=4)
@@ -227,15 +227,15 @@ def _remove_drift(
 ) -> tuple[np.ndarray, tuple[str, ...], tuple[str, ...]]:
     """The signal without its drift, what was done, and what is advised, in words."""
     rise, error = _fit_drift(t, x, cycle)
-    share = abs(rise) / _measure_level(t, x)
-    counts = abs(rise) > CERTAIN * error and share > DRIFT
+    fraction = abs(rise) / _measure_level(t, x)
+    counts = abs(rise) > CERTAIN * error and fraction > DRIFT
     if detrend is True or (detrend == "auto" and counts and cycle is not None):
         line = rise * ((t - t[0]) / (t[-1] - t[0]) - 0.5)
         return x - line, (f"a straight line taken out, which rises by {rise:.3g}",), ()
     if not counts:
         return x, (), ()
     advice = (
-        f"{name} drifts by {rise:.3g} over the record, {100.0 * share:.0f} % of its "
+        f"{name} drifts by {rise:.3g} over the record, {100.0 * fraction:.0f} % of its "
         f"{'troughs' if is_positive(t, x) else 'standard deviation'}: detrend=true takes a "
         "straight line out"
     )

@@ -29,9 +29,8 @@ import ep2sindy as ep
 from benchmarks.source import measured_sets
 from ep2sindy.data.sampling import ZoneAverage, side_by_side
 from ep2sindy.library.relations import Constraint
-from ep2sindy.library.roles import shares_of, sum_known
+from ep2sindy.library.roles import fractions_of, sum_known
 from ep2sindy.refinement.refine import with_coef
-from ep2sindy.studies.living import start_of
 from ep2sindy.studies.processes import (
     ComparedProcess,
     Zones,
@@ -39,8 +38,9 @@ from ep2sindy.studies.processes import (
     ends_of,
     fitted_rate,
     recorded_rates,
-    told_roles,
+    stated_roles,
 )
+from ep2sindy.studies.sustained import start_of
 
 POINTS = {point.label: point for point in ep.thruster.OPERATING_POINTS}
 CHANNEL, DOWNSTREAM = "channel", "downstream"
@@ -49,7 +49,7 @@ SPLITS = {"last": (0.0, 0.75), "first": (0.25, 1.0), "second half": (0.0, 0.5)} 
 DRAWS = [(split, seed) for split in SPLITS for seed in range(3)] + [("last", 3)]
 ONCE = [(split, 0) for split in SPLITS]
 N_SEEDS = 1  # in other zones
-NOISES = ((0.2, 6.0), (0.4, 50.0))  # share of each state's RMS, periods
+NOISES = ((0.2, 6.0), (0.4, 50.0))  # fraction of each state's RMS, periods
 N_NOISE_DRAWS = 3
 LONGER = 10.0  # times the held-out part, for the other solver
 STATES = ("n_i", "n_n")
@@ -65,7 +65,7 @@ FORMER_SPEED = {"300V_2mgs": 190.0}  # m/s; 280 at the other points
 MASS_ACTION = ep.Roles(
     exchange=[("n_n", "n_i")], outflow=STATES, inflow={"n_n": "known or free"}, nonnegative=True
 )
-TOLD = replace(
+MIN_PROBABILITY = replace(
     MASS_ACTION,
     exchange=[("n_n", "n_i"), ("n_i", "n_n", "known")],
     outflow={"n_i": "free", "n_n": "known"},
@@ -111,13 +111,14 @@ class Record:
 class Case:
     """One selection: the model on held-out time, what it cost, and what another solver says.
 
-    share: of starts around the cycle that reach it. processes: name -> ratio to the record and R2.
+    fraction: of starts around the cycle that reach it. processes: name -> ratio to the record and
+    R2.
     """
 
     run: ep.model.Evaluation
     n_free: int
     multiplier: float
-    share: float
+    fraction: float
     cpu_s: float
     confirmed: bool
     processes: dict[str, tuple[float, float]]
@@ -187,9 +188,9 @@ def conserving(fitted: ep.Trajectory, whole: Record, *, seed: int) -> ep.Discove
     return under(MASS_ACTION, fitted, whole, seed=seed)
 
 
-def told(fitted: ep.Trajectory, whole: Record, *, seed: int) -> ep.Discovery:
-    """The same where what the record tells is known: `living=told`."""
-    return under(TOLD, fitted, whole, seed=seed)
+def stated(fitted: ep.Trajectory, whole: Record, *, seed: int) -> ep.Discovery:
+    """The same where what the record tells is known: `sustained=stated`."""
+    return under(MIN_PROBABILITY, fitted, whole, seed=seed)
 
 
 class AllTerms:
@@ -226,7 +227,7 @@ def under(
 
 def known_of(fitted: ep.Trajectory, whole: Record) -> dict[str, dict[str, float]]:
     """What the record tells of the roles of a zone, by least squares over what is fitted."""
-    found = told_roles(whole.balances, fitted)
+    found = stated_roles(whole.balances, fitted)
     return {name: dict(role.terms) for name, role in found.items()}
 
 
@@ -261,7 +262,7 @@ NOISY = ((CHANNEL, conserving), (DOWNSTREAM, free))  # zones and searches of the
 
 def case(
     fitted: ep.Trajectory,
-    judged: ep.Trajectory,
+    assessed: ep.Trajectory,
     whole: Record,
     *,
     seed: int,
@@ -271,16 +272,16 @@ def case(
     begun = time.process_time()
     found = search(fitted, whole, seed=seed)
     cpu_s, model = time.process_time() - begun, found.model
-    run = ep.evaluate(model, judged, initial=start_of(judged, model))
-    multiplier = share = float("nan")
+    run = ep.evaluate(model, assessed, initial=start_of(assessed, model))
+    multiplier = fraction = float("nan")
     if run.status is ep.model.Status.SUSTAINED and (cycle := run.cycle) is not None:
         multiplier = float(np.abs(cycle.multipliers[1:]).max())
-        share = run.share_reaching
-    confirmed = run.status is not ep.model.Status.SUSTAINED or lives_on(model, judged)
+        fraction = run.basin_stability
+    confirmed = run.status is not ep.model.Status.SUSTAINED or lives_on(model, assessed)
     held = found.constraint
     n_free = int(np.count_nonzero(model.coef)) if held is None else len(held.free)
     processes = {p.name: (p.ratio, p.r2) for p in whole.processes(model, held)}
-    return Case(run, n_free, multiplier, share, cpu_s, confirmed, processes)
+    return Case(run, n_free, multiplier, fraction, cpu_s, confirmed, processes)
 
 
 def lives_on(model: ep.SparseModel, run: ep.Trajectory) -> bool:
@@ -302,44 +303,45 @@ def lives_on(model: ep.SparseModel, run: ep.Trajectory) -> bool:
 
 def parts(run: ep.Trajectory, split: str) -> tuple[ep.Trajectory, ep.Trajectory]:
     """What is fitted, and the rest."""
-    first, last = (round(share * run.n_samples) for share in SPLITS[split])
+    first, last = (round(fraction * run.n_samples) for fraction in SPLITS[split])
     held = (last, run.n_samples) if first == 0 else (0, first)
     return run.window(first, last), run.window(*held)
 
 
 def line(name: str, cases: Sequence[Case]) -> str:
     """How many live, and the median and the worst of each figure of those that have it."""
-    living = [each for each in cases if each.run.status is ep.model.Status.SUSTAINED]
+    sustained = [each for each in cases if each.run.status is ep.model.Status.SUSTAINED]
     wrong = sum(not each.confirmed for each in cases)
-    if not living:
+    if not sustained:
         return f"{name:24s} 0 of {len(cases)} live: {[c.run.text for c in cases][:3]}"
     figures = (
         (100.0 * abs(c.run.f_error), 100.0 * c.amplitude, c.waveform, c.n_free, c.multiplier)
-        for c in living
+        for c in sustained
     )
     f, amplitude, waveform, n_free, multiplier = (
         f"{np.nanmedian(v):.3g} / {np.nanmax(v):.3g}" for v in zip(*figures, strict=True)
     )
-    shares = [c.share for c in living]
+    fractions = [c.fraction for c in sustained]
     cpu_s = np.median([c.cpu_s for c in cases])
     lost = Counter(
         each.run.text for each in cases if each.run.status is not ep.model.Status.SUSTAINED
     )
     return (
-        f"{name:24s} {len(living)} of {len(cases)} live ({wrong} refuted); f {f} %; "
+        f"{name:24s} {len(sustained)} of {len(cases)} live ({wrong} refuted); f {f} %; "
         f"amplitude {amplitude} %; waveform {waveform}; free coefficients {n_free}; multiplier "
-        f"{multiplier}; starts that reach it {np.nanmin(shares):.2f} to {np.nanmax(shares):.2f}; "
+        f"{multiplier}; starts that reach it {np.nanmin(fractions):.2f} to "
+        f"{np.nanmax(fractions):.2f}; "
         f"{cpu_s:.1f} CPU-s{f'; {dict(lost)}' if lost else ''}"
     )
 
 
 def balances(cases: Sequence[Case]) -> str:
     """For every process, the ratio to the record and R2: medians over the cases."""
-    living = [each.processes for each in cases]
-    names = dict.fromkeys(name for each in living for name in each)
+    sustained = [each.processes for each in cases]
+    names = dict.fromkeys(name for each in sustained for name in each)
     rows = []
     for name in names:
-        ratios, scores = np.transpose([each[name] for each in living if name in each])
+        ratios, scores = np.transpose([each[name] for each in sustained if name in each])
         text = f"ratio {np.median(ratios):.2f} ({ratios.min():.2f} to {ratios.max():.2f})"
         score = "" if np.isnan(scores).all() else f", R2 {np.median(scores):.3f}"
         rows.append(f"    {name}: {text}{score}")
@@ -391,7 +393,7 @@ def print_law(roles: ep.Roles, name: str = "default") -> None:
 
 
 def by_the_record(
-    found: ep.Discovery, compared: Sequence[ComparedProcess], judged: ep.Trajectory
+    found: ep.Discovery, compared: Sequence[ComparedProcess], assessed: ep.Trajectory
 ) -> ep.model.Evaluation:
     """The terms of a model with the coefficients of the record, run freely."""
     held, model = found.constraint, found.model
@@ -399,10 +401,10 @@ def by_the_record(
     recorded = {(p.ends, term): value for p in compared for term, value in p.counterpart.items()}
     values = [recorded[ends_of(process), process.term] for process in held.processes]
     known = sum_known(held.known)
-    told = [known.get(held.coefficients[k], 0.0) for k in held.free]
-    coef = held.coef(shares_of(held) @ np.array(values) + told)
+    stated = [known.get(held.coefficients[k], 0.0) for k in held.free]
+    coef = held.coef(fractions_of(held) @ np.array(values) + stated)
     changed = with_coef(model, held, coef)[0]
-    return ep.evaluate(changed, judged, initial=start_of(judged, model))
+    return ep.evaluate(changed, assessed, initial=start_of(assessed, model))
 
 
 def print_profiles() -> None:
@@ -449,13 +451,13 @@ def print_zones(name: str = "default") -> None:
         print(line(words, cases), flush=True)
 
 
-def noisy(run: ep.Trajectory, share: float, n_periods: float, *, seed: int) -> ep.Trajectory:
-    """The first periods of a record with white noise, a share of each state's RMS."""
+def noisy(run: ep.Trajectory, fraction: float, n_periods: float, *, seed: int) -> ep.Trajectory:
+    """The first periods of a record with white noise, a fraction of each state's RMS."""
     cycle = ep.signals.find_cycle(run.t, run.states)
     assert cycle is not None
     n = round(n_periods / (cycle.frequency_Hz * run.dt_s)) + 1
     rms = np.sqrt(np.square(run.states).mean(axis=0))
-    noise = np.random.default_rng(seed).normal(size=(n, run.states.shape[1])) * share * rms
+    noise = np.random.default_rng(seed).normal(size=(n, run.states.shape[1])) * fraction * rms
     return ep.Trajectory(
         t=run.t[:n], states=run.states[:n] + noise, state_names=run.state_names,
         units=run.units, label=run.label,
@@ -463,22 +465,22 @@ def noisy(run: ep.Trajectory, share: float, n_periods: float, *, seed: int) -> e
 
 
 def print_noise() -> None:
-    """White noise on both densities, the mean cycle searched; judged on the clean record."""
-    for (share, n_periods), (z, search) in product(NOISES, NOISY):
-        words = f"{100 * share:.0f} % noise, {n_periods:.0f} periods, {z}, {search.__name__}"
+    """White noise on both densities, the mean cycle searched; assessed on the clean record."""
+    for (fraction, n_periods), (z, search) in product(NOISES, NOISY):
+        words = f"{100 * fraction:.0f} % noise, {n_periods:.0f} periods, {z}, {search.__name__}"
         print(f"\n{words}: {N_NOISE_DRAWS} draws; noise in standard deviations of n_n")
         for label in POINTS:
             whole = record(label, z)
             clean = whole.run.window(round(0.75 * whole.run.n_samples), whole.run.n_samples)
             cases = [
                 case(
-                    ep.signals.mean_cycle(noisy(whole.run, share, n_periods, seed=k)),
+                    ep.signals.mean_cycle(noisy(whole.run, fraction, n_periods, seed=k)),
                     clean, whole, seed=k, search=search,
                 )
                 for k in range(N_NOISE_DRAWS)
             ]  # fmt: skip
             n_n = whole.run.states[:, 1]
-            spread = share * np.sqrt(np.square(n_n).mean()) / n_n.std()
+            spread = fraction * np.sqrt(np.square(n_n).mean()) / n_n.std()
             print(line(f"{label}, {spread:.1f} std", cases), flush=True)
 
 
@@ -505,7 +507,7 @@ def main() -> None:
         "law_back": lambda: print_law(LAW_BACK),
         "profiles": print_profiles,
         "former": lambda: print_points("former", draws=ONCE),
-        "lif": lambda: print_points("lif", search=told, draws=ONCE),
+        "lif": lambda: print_points("lif", search=stated, draws=ONCE),
         "lif_law": lambda: print_law(LAW, "lif"),
         "lif_law_told": lambda: print_law(LAW_TOLD, "lif"),
         "lif_law_back": lambda: print_law(LAW_BACK, "lif"),
