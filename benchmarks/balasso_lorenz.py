@@ -5,7 +5,7 @@
 Realizations and variant of `+exp=benchmark`, with one thing in the making changed, then several
 together. Counts at 5 and 20 % noise: the true supports of all three equations lead their sizes
 (the thesis's Table II), that of each does, and all three are among what the search proposed;
-beside them the median coefficient of y in y', -1 in truth, where the true terms are fitted.
+next to them the median coefficient of y in y', -1 in truth, where the true terms are fitted.
 """
 
 from __future__ import annotations

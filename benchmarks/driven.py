@@ -3,13 +3,13 @@
 `records`: one signal of a driven pendulum, a Duffing oscillator, a tank and a probe, each with an
 input that is held (random levels), linear (a triangle) or smooth (a cosine) and with 2 and 10 %
 noise. Counted are laws that have the right terms with the input named, the forecasts' root mean
-square error over the first period in standard deviations, beside that of an autoregression that
-knows the input, and questions: where the column stands beside the signal but nobody named it, and
+square error over the first period in standard deviations, next to that of an autoregression that
+knows the input, and questions: where the column stands next to the signal but nobody named it, and
 where the file lacks it.
 
 `questions`: whether it is asked of other driven signals (a probe's current at a round and another
 frequency; a pendulum under random perturbations; ten square waves behind a relaxation), and of
-self-sustained ones, where a question is false, their other states beside them.
+self-sustained ones, where a question is false, their other states next to them.
 
 `discharge`: the supply's voltage is modulated by 5 % at half and at twice the breathing frequency.
 The search is given both records, averaged over the channel, with the voltage as an input and
@@ -145,7 +145,7 @@ CASES = {
 
 
 def is_asked(run: ep.Trajectory, beside: Mapping[str, np.ndarray]) -> bool:
-    """Whether the signal x of a run looks driven, with other columns beside it."""
+    """Whether the signal x of a run looks driven, with other columns next to it."""
     try:
         signal = prepare_signal(ep.Trajectory(run.t, run.columns(["x"]), ["x"]))
     except ValueError:  # no oscillation
@@ -156,7 +156,7 @@ def is_asked(run: ep.Trajectory, beside: Mapping[str, np.ndarray]) -> bool:
 
 def records() -> None:
     """Print the table of driven records."""
-    print("records | input | noise | law right | error, ARX's | asked beside u | without u")
+    print("records | input | noise | law right | error, ARX's | asked next to u | without u")
     for (name, case), course, noise in product(CASES.items(), WAVES, (0.02, 0.1)):
         right, beside, alone, errors = 0, 0, 0, []
         for seed in range(N_DRAWS):
@@ -309,7 +309,7 @@ def followed(
 
 
 def tell(words: str, runs: Sequence[ep.Trajectory]) -> None:
-    """Print how often it is asked with the other columns beside x, and without."""
+    """Print how often it is asked with the other columns next to x, and without."""
     tables = [
         dict(zip(run.names, np.column_stack([run.states, run.inputs]).T, strict=True))
         for run in runs
@@ -341,7 +341,7 @@ def relaxation(
 
 def questions() -> None:
     """Print how often it is asked of driven and of self-sustained signals."""
-    print(f"driven, asked of {N_DRAWS} | column beside | none")
+    print(f"driven, asked of {N_DRAWS} | column next to | none")
     for lag, round_, noise in product((0.0, 0.05), (True, False), (0.02, 0.1)):
         how = f"{'lagging' if lag else 'static'}, {'500 Hz' if round_ else 'any frequency'}"
         runs = [
@@ -362,7 +362,7 @@ def questions() -> None:
             for run, rng in zip(case.runs(pushes, 0.02, n, seed=0), generators(), strict=True)
         ]
         tell(f"{name}, any frequency, pushes of {100 * pushes:.0f} %, {n} periods", runs)
-    print("self-sustained, asked falsely | columns beside | none")
+    print("self-sustained, asked falsely | columns next to | none")
     for (name, case), pushes, n in product(SELF_SUSTAINED.items(), PUSHES, LENGTHS):
         made = case.runs(pushes, 0.02, n, seed=0)
         for round_ in (False, True):

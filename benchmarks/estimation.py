@@ -7,7 +7,7 @@
     python -m benchmarks.estimation samples             # CPU against the number of samples
     python -m benchmarks.estimation waves [--sizes 5 8 12 20 40] [--n 3]  # Lorenz-96 of many states
     python -m benchmarks.estimation chain [--sizes 20] [--n 3]            # coupled van der Pol's
-    python -m benchmarks.estimation thruster            # the breathing mode, beside free runs
+    python -m benchmarks.estimation thruster            # the breathing mode, next to free runs
     python -m benchmarks.estimation collection [--n 3] [--noises ...]  # dysts: classes of failure
     python -m benchmarks.estimation courses --n 3 --noises 0.05        # inputs between samples
     python -m benchmarks.estimation penalties [--n 1] [--noises ...]      # dysts: penalty of a term

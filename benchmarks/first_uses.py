@@ -3,7 +3,7 @@
 python -m benchmarks.first_uses brusselator   # 18 draws: no sensor called late, law found after
 python -m benchmarks.first_uses oregonator    # 34 cycles of a stiff reaction: never x' = 0
 python -m benchmarks.first_uses populations   # counts of animals: a law, or what is lacking
-python -m benchmarks.first_uses ahead         # four tables of them: forecasts beside a VAR
+python -m benchmarks.first_uses ahead         # four tables of them: forecasts next to a VAR
 python -m benchmarks.first_uses long          # 200,000 samples of two channels: CPU-s, and the law
 """
 
@@ -166,7 +166,7 @@ def long_record() -> None:
     run, began = system.trajectory(noise=0.02, rng=0), time.process_time()
     found = ep.discover(run)
     cpu_s, law = time.process_time() - began, "; ".join(found.model.text().splitlines())
-    print(f"{run.n_samples} samples: {cpu_s:.1f} CPU-s; {found.remarks[-1]}\n{law}")
+    print(f"{run.n_samples} samples: {cpu_s:.1f} CPU-s; {found.data_warnings[-1]}\n{law}")
     print(found.lack_of_fit or "no lack of fit")
 
 

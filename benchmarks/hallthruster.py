@@ -145,7 +145,7 @@ def calibrated_run(
 def reduced_run(name: str, *, duration_s: float = 2e-3, n_cells: int = 150) -> xr.Dataset:
     """The same with two charges and without the plume's area, and with the flow that is ingested.
 
-    Neutrals have the default speed: a speed beside `propellants`, as in these files, is read by
+    Neutrals have the default speed: a speed next to `propellants`, as in these files, is read by
     neither code. The ingested flow is taken at a pressure in Pa (HallThruster.jl takes Torr).
     """
     flow = (5.0 + INGESTED_MG_S[name]) * 1e-6

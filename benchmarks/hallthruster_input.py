@@ -235,7 +235,7 @@ CONFIG_AT_REST: dict[str, Any] = {
     "propellant_config": "",
     "implicit_energy": 1.0,
 }
-# Keys of the propellant before 0.19; beside `propellants` HallThruster.jl reads none of them.
+# Keys of the propellant before 0.19; next to `propellants` HallThruster.jl reads none of them.
 FLOW = {
     "gas": "propellant", "flow_rate_kg_s": "anode_mass_flow_rate",
     "velocity_m_s": "neutral_velocity", "temperature_K": "neutral_temperature_K",
@@ -282,7 +282,7 @@ def read_hallthruster_input(path: str | Path) -> HallThrusterInput:
     """Read an input file of HallThruster.jl, or an output file, which holds its input.
 
     Missing entries have HallThruster.jl's defaults. The file of the magnetic field is looked for
-    beside the JSON file, then in the current folder. The single loss_scale of a wall in
+    next to the JSON file, then in the current folder. The single loss_scale of a wall in
     HallThruster.jl sets both of ours. Its conductivity multiplies the gradient of 1.5 T_e, so that
     our factor is 1.5 times its own. Raises ValueError for an unknown key, and for one that asks for
     physics that is missing here (mixtures, a shielded wall, LANDMARK), naming it.

@@ -1,4 +1,4 @@
-"""Systems with known equations beside the thesis's four, and noise of several kinds on all.
+"""Systems with known equations next to the thesis's four, and noise of several kinds on all.
 
 Equations and parameters are the textbooks'; each is sampled over some twenty of its turns.
 """

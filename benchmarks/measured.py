@@ -5,7 +5,7 @@
     python -m benchmarks.measured pendulum populations current bands process_noise hidden offset
 
 `+exp=trace` as it comes is run on every record; what differs is written with its row. Errors are
-root mean squares over starts, in standard deviations of the held-out samples, beside persistence
+root mean squares over starts, in standard deviations of the held-out samples, next to persistence
 and an autoregression by AIC; every start is fitted to the past alone. Records that are not shipped
 lie in the folder of EP2SINDY_DATA. Prints the tables of docs/measured.md.
 
@@ -51,7 +51,7 @@ NOISE = 0.02  # of the simulator's current, as a fraction of its mean
 
 @dataclass(frozen=True, eq=False)
 class Traced:
-    """What `+exp=trace` wrote: summary, errors by horizon, and the free run beside the data.
+    """What `+exp=trace` wrote: summary, errors by horizon, and the free run next to the data.
 
     screen: what it printed. cpu_s: what it took.
     """

@@ -4,8 +4,8 @@
 
 Five networks of three to five species, one record each of 800 samples at 1 and 5 % noise (of each
 state's RMS), and an epidemic with births and deaths at 20 %. Right means that exactly the true
-terms were found. Beside it the same search without roles. Then 64 random starts of every model that
-was found under roles are followed: how many turn negative.
+terms were found. Next to it the same search without roles. Then 64 random starts of every model
+that was found under roles are followed: how many turn negative.
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ which the supports of all equations are right: of one search over all points, of
 with shared coefficients, and of every point alone; then the errors of the coefficients.
 `grid`: the package's own discharge at 290 to 370 V and 4 to 5.5 mg/s, five by five, 6 ms each,
 densities averaged over the channel. Every point is left out in turn of quadratic laws, for the
-models of conf/exp/predict.yaml and some beside them; then the law of the study's choice at points
+models of conf/exp/predict.yaml and some next to them; then the law of the study's choice at points
 drawn between.
 """
 

@@ -1,6 +1,6 @@
 """The pointwise study on a grid of 41 x 49 points and 12001 samples, read from disk, on one core.
 
-Five terms, two equations, best supports of every size, 32 bootstraps of the rows. Beside it, per
+Five terms, two equations, best supports of every size, 32 bootstraps of the rows. Next to it, per
 point: the plain way (scikit-learn's `lasso_path` with 100 penalties on the resampled rows of every
 bootstrap, `lstsq` for every support found), and PySINDy's `EnsembleOptimizer` (32 models) at ten
 thresholds; both are given rows that are ready, and only a few points of the same grid.

@@ -8,7 +8,7 @@ assembled rows and end with the best candidate of every size on the held-out row
 
 Then the calls that a user makes: `ep.discover` by the thesis's recipe, by one threshold sweep, and
 by default, each with its test whether the model leaves more than noise; and of 100,000 samples.
-PySINDy's fit beside it is given one threshold, and tests nothing.
+PySINDy's fit next to it is given one threshold, and tests nothing.
 
     python -m benchmarks.search
     python -m benchmarks.search long   # calls on 10,000,000 samples, and on 200 runs

@@ -1,8 +1,8 @@
 """How far the embedded thruster model can be relied on: `python -m benchmarks.source`.
 
 One cycle at every operating point, from hard and soft starts, on several grids and time steps;
-balances; no alternation of T_e; the cycles beside the default set; and what is measured of an
-SPT-100 beside what the default set and `thruster=lif` have.
+balances; no alternation of T_e; the cycles next to the default set; and what is measured of an
+SPT-100 next to what the default set and `thruster=lif` have.
 Prints the tables of docs/thruster.md; tests/test_thruster_reference.py holds them.
 """
 
@@ -228,7 +228,7 @@ def print_walls() -> None:
 
 
 def print_neighbours() -> None:
-    """Which cycle a guessed and a hard start reach beside the default set."""
+    """Which cycle a guessed and a hard start reach next to the default set."""
     print("\nI_d std (A) / f (kHz) from a guessed | a hard start, 4 to 8 ms, by c2")
     for label in ("300V_2mgs", "400V_5mgs"):
         for inverse in NEIGHBOURS:

@@ -1,6 +1,6 @@
 """Search for a transport profile with the measured ion speeds, current and thrust of an SPT-100.
 
-    python -m benchmarks.source_search --n 200 --out DIR          # goes on from DIR/sets.csv
+    python -m benchmarks.source_search --n 200 --out DIR          # continues from DIR/sets.csv
     python -m benchmarks.source_search --n 200 --out DIR --hold conduction=2.3 --hold drift=0
     python -m benchmarks.source_search front DIR
 
@@ -222,7 +222,7 @@ def trial(population: np.ndarray, k: int, rng: np.random.Generator) -> np.ndarra
 
 
 def search(folder: Path, n: int, held: Mapping[str, float], limit_s: float) -> None:
-    """Try n sets, or as many as fit into limit_s, beside those of the folder."""
+    """Try n sets, or as many as fit into limit_s, next to those of the folder."""
     folder.mkdir(parents=True, exist_ok=True)
     first, began = to_unit(numbers_of(measured_sets()["lif"][0], LIF_SPEED)), time.monotonic()
     for _ in range(n):

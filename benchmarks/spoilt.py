@@ -2,7 +2,7 @@
 
     python -m benchmarks.spoilt [--systems lorenz ...] [--kinds ...] [--n 5] [--noise 0.02]
 
-Per kind and system: right; wrong without a word; wrong with a remark or "not decided" alone; right
+Per kind and system: right; wrong without a word; wrong with a warning or "ambiguous" alone; right
 and reported as a lack of fit. With `--words`, what was stated of the second, third and fourth.
 """
 
@@ -165,7 +165,7 @@ def main() -> None:
             what = _what(system, found)
             counts[what] += 1
             if asked.words and what not in ("right", "wrong, a lack of fit"):
-                print(f"  {number} {what}: {found.note[:160]} {list(found.remarks)}")
+                print(f"  {number} {what}: {found.note[:160]} {list(found.data_warnings)}")
         total += counts
         cpu_s = (time.process_time() - start) / asked.n
         print(f"{kind:15} {name:16} {_line(counts)}  CPU-s {cpu_s:.2f}", flush=True)
@@ -178,7 +178,7 @@ def _what(system: System, found: ep.Discovery) -> str:
         return "right, a lack of fit" if found.lack_of_fit else "right"
     if found.lack_of_fit:
         return "wrong, a lack of fit"
-    doubted = found.remarks or found.note.startswith("not decided")
+    doubted = found.data_warnings or found.note.startswith("ambiguous")
     return "wrong, a doubt" if doubted else "wrong, silent"
 
 

@@ -1,4 +1,4 @@
-"""Selecting by trajectories: refined and free, and by EBIC beside them.
+"""Selecting by trajectories: refined and free, and by EBIC next to them.
 
     python -m benchmarks.trajectory_scores --n 12 [--systems lotka_volterra lorenz] [--rules EBIC]
 

@@ -1,8 +1,8 @@
 """The names that users see: read from the stubs (`.pyi`), loaded when they are first used.
 
-A stub stands beside the package and beside each of its rooms that has names for users. It is the
-one text for this loader, for type checkers and editors, for the reference of the documentation and
-for what configs may call. Of its lines are read
+A stub stands next to the package and next to each of its subpackages that has names for users. It
+is the one text for this loader, for type checkers and editors, for the reference of the
+documentation and for what configs may call. Of its lines are read
 
     # Data                                        a heading, which is a page of the reference
     from ep2sindy.data.open import write_field as write_field
@@ -40,7 +40,7 @@ class Entry(NamedTuple):
 
 @cache
 def read_stub(module: str) -> dict[str, Entry]:
-    """Name -> what the stub of the package or of one of its rooms says of it, in its order."""
+    """Name -> what the stub of the package or of a subpackage says of it, in its order."""
     import ast  # here, for it takes longer than all else that `import ep2sindy` does
 
     with open(_stub_file(module), encoding="utf-8") as file:
@@ -69,19 +69,19 @@ def _stub_file(module: str) -> str:
     return path.join(place, "__init__.pyi") if path.isdir(place) else f"{place}.pyi"
 
 
-def rooms() -> list[str]:
-    """The package and its rooms that have names for users."""
+def subpackages() -> list[str]:
+    """The package and its subpackages that have names for users."""
     own = [name for name, entry in read_stub(PACKAGE).items() if entry.module == PACKAGE]
     return [PACKAGE, *(f"{PACKAGE}.{name}" for name in own)]
 
 
 @cache
 def dotted_names() -> dict[str, Entry]:
-    """All names, in full: `ep2sindy.EBIC`, `ep2sindy.data.crop`; but for the rooms."""
+    """All names, in full: `ep2sindy.EBIC`, `ep2sindy.data.crop`; but for the subpackages."""
     return {
-        f"{room}.{name}": entry
-        for room in rooms()
-        for name, entry in read_stub(room).items()
+        f"{subpackage}.{name}": entry
+        for subpackage in subpackages()
+        for name, entry in read_stub(subpackage).items()
         if entry.module != PACKAGE
     }
 
@@ -93,7 +93,7 @@ def place_of(kind: type) -> str | None:
 
 
 def attach(module: str) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
-    """`__getattr__` and `__dir__` of a module that has a stub beside it.
+    """`__getattr__` and `__dir__` of a module that has a stub next to it.
 
     A name stays in the module once it is loaded.
     """
@@ -110,7 +110,7 @@ def attach(module: str) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
             near = _near(f"{module}.{name}")
             raise AttributeError(f"module {module!r} has no attribute {name!r}; {near}")
         if entry.module == module:
-            return import_module(f"{module}.{name}")  # a room
+            return import_module(f"{module}.{name}")  # a subpackage
         value = entry.load()
         setattr(sys.modules[module], name, value)
         return value
@@ -128,7 +128,7 @@ def _near(absent: str) -> str:
         return f"{look}, or import {absent}"
     from difflib import get_close_matches
 
-    known = {each: each.rpartition(".")[2].lower() for each in (*dotted_names(), *rooms())}
+    known = {each: each.rpartition(".")[2].lower() for each in (*dotted_names(), *subpackages())}
     alike = get_close_matches(name.lower(), set(known.values()))
     near = [each for word in alike for each in known if known[each] == word]
     if not near:

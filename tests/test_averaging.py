@@ -32,7 +32,7 @@ def damped(n: int = 30_000, *, held: int = 0) -> ep.Trajectory:
 def test_the_law_of_a_long_record_is_found_in_its_means() -> None:
     run = damped()
     found = ep.discover(run)
-    (words,) = (text for text in found.remarks if "means" in text)
+    (words,) = (text for text in found.data_warnings if "means" in text)
     assert words == "means over 14 samples: 2142 are left; decimate=None takes all samples"
     assert found.model.terms("x") == pytest.approx({"v": 1.0}, abs=2e-3)
     assert found.model.terms("v") == pytest.approx({"x": -1.0}, abs=2e-3)
@@ -61,7 +61,7 @@ def test_means_of_several_records_are_alike_and_cross_no_gap() -> None:
     assert (steps > 1.5 * np.median(steps)).sum() == 1
 
 
-def test_records_stay_as_they_are_that_are_short_or_lack_samples_or_are_told_to() -> None:
+def test_records_stay_as_they_are_that_are_short_or_lack_samples_or_are_stated_to() -> None:
     run = damped()
     missing = np.zeros((run.n_samples, 2), dtype=np.bool_)
     missing[5, 0] = True
@@ -77,7 +77,7 @@ def test_records_stay_as_they_are_that_are_short_or_lack_samples_or_are_told_to(
         average_alike([run], 0)
 
 
-def test_what_is_fast_beside_the_period_is_kept() -> None:
+def test_what_is_fast_next_to_the_period_is_kept() -> None:
     run = damped()
     fast = 0.5 * np.sin(40.0 * run.t)  # 36 samples to one of its periods
     found, _ = average_long([replace(run, states=run.states + fast[:, None])], "auto")

@@ -146,9 +146,9 @@ def test_a_restart_at_another_operating_point_is_a_continuation(run):
             ep.thruster.Thruster(propellant=ep.thruster.propellant("krypton")), initial=run),
          r"only in the same thruster: propellant was"),
         (lambda run: brief(initial=run.assign_attrs(status="diverged")),
-         r"only from one that lived: this one diverged, .* start from ColdStart or SoftStart"),
+         r"only from one that did not diverge, .* start from ColdStart or SoftStart"),
         (lambda run: brief(initial=run[["n_i"]]), r"must be a run of simulate, which keeps"),
-        (lambda run: brief(initial="there/is/none.nc"), r"no such run to go on from: /"),
+        (lambda run: brief(initial="there/is/none.nc"), r"no such run to continue from: /"),
         
         (lambda run: brief(cfl=1.5), r"cfl must be above 0 and at most 1, got 1\.5"),
         (lambda run: ep.thruster.SoftStart(resistance=-1.0),
@@ -200,7 +200,7 @@ def test_a_stretched_grid_has_long_cells_in_the_plume():
 @pytest.mark.parametrize(
     ("f_Hz", "status"), [(15e3, "oscillating"), (58e3, "oscillating"), (143e3, "transit")]
 )
-def test_a_transit_oscillation_is_told_from_breathing(f_Hz, status):
+def test_a_transit_oscillation_is_stated_from_breathing(f_Hz, status):
     t = 1.5e-6 * np.arange(4000)
     assert assess_status(4.0 + np.sin(2e0 * np.pi * f_Hz * t), 1.5e-6) == status
 

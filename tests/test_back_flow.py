@@ -8,7 +8,7 @@ from tests.programs import composed, computed
 
 
 @pytest.mark.slow
-def test_where_ions_flow_back_a_law_is_found_that_lives(tmp_path: Path) -> None:
+def test_where_ions_flow_back_a_law_is_found_that_is_sustained(tmp_path: Path) -> None:
     found = computed(
         composed(
             "+exp=breathing",
@@ -28,4 +28,4 @@ def test_where_ions_flow_back_a_law_is_found_that_lives(tmp_path: Path) -> None:
     leave = {term: each for (part, term), each in balance.items() if part == "ions that leave"}
     assert set(leave) == {"n_i", "n_i^2", "n_i*n_n^2"}
     for each in leave.values():
-        assert each["ratio"] == pytest.approx(1.0, abs=0.2)  # beside the record's
+        assert each["ratio"] == pytest.approx(1.0, abs=0.2)  # next to the record's

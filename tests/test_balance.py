@@ -1,4 +1,4 @@
-"""Balance of a zone: exact from averages, estimated from fields, and beside a model."""
+"""Balance of a zone: exact from averages, estimated from fields, and next to a model."""
 
 from dataclasses import replace
 
@@ -57,7 +57,7 @@ def test_the_supply_is_the_mass_flow(field: xr.Dataset, exact: xr.Dataset) -> No
     assert stated["n_n in"].terms == {"1": pytest.approx(particles / length_m, rel=1e-5)}
 
 
-def test_what_leaves_and_comes_back_is_told_by_least_squares(exact: xr.Dataset, data) -> None:
+def test_what_leaves_and_comes_back_is_stated_by_least_squares(exact: xr.Dataset, data) -> None:
     """A balance that is made of the terms themselves gives their coefficients."""
     n_i, n_n = data.states.T
     made = exact.assign(
@@ -147,7 +147,7 @@ def test_processes_of_a_conserving_model(data: ep.Trajectory, exact: xr.Dataset)
 
 
 def test_what_ions_give_back_by_a_process_of_their_own_is_compared(data, exact) -> None:
-    """Told or found, it stands beside what walls and anode give back, and ionization is whole."""
+    """Told or found, it stands next to what walls and anode give back, and ionization is whole."""
     stated = replace(ROLES, exchange=[("n_n", "n_i"), ("n_i", "n_n", {"n_i": 1e5})])
     free = VALUES | {("n_i to n_n", "n_i"): 1e5}
     for roles, values in ((stated, VALUES), (ROLES, free)):

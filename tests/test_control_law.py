@@ -65,7 +65,7 @@ def test_leave_one_out_errors_are_those_of_fits_without_the_point(seed: int) -> 
     assert law.loo_error == pytest.approx(error, rel=1e-6)
 
 
-def test_the_search_is_judged_by_points_it_never_saw() -> None:
+def test_the_search_is_assessed_by_points_it_never_saw() -> None:
     values = np.random.default_rng(3).normal(size=6) + 4.0
     law = fit_control_law(values, POINTS, LIBRARY)
     errors = []

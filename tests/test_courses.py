@@ -79,7 +79,7 @@ def test_the_course_is_found_with_the_law(course: str, hold: int) -> None:
         assert low < LAG.terms("x")[name] < high
 
 
-def test_a_course_that_is_told_is_kept() -> None:
+def test_a_course_that_is_stated_is_kept() -> None:
     run = lag("held", hold=1, seed=3, noise=0.05)
     stated = ep.discover(run, LIBRARY, method=ep.TrajectorySearch(courses={"u": "linear"}))
     assert dict(stated.model.courses) == {"u": "linear"}

@@ -131,7 +131,7 @@ def test_what_an_equation_leaves_tells_whether_a_term_is_missing(recipe: AnyMeth
     assert lacking.model.covariance is None
 
 
-def test_an_equation_without_terms_is_a_misfit_where_its_state_moves() -> None:
+def test_an_equation_without_terms_is_a_lack_of_fit_where_its_state_moves() -> None:
     run = lotka_volterra().trajectory(noise=0.05, rng=0)
     only_one = polynomial(["x", "y"], degree=0)
     rule = EBIC(gamma=0.0, coarsening=None)
@@ -144,7 +144,7 @@ FORMS = [Differential(), Weak(), WeightedWeak()]
 
 
 @pytest.mark.parametrize("formulation", FORMS, ids=["differential", "weak", "weighted"])
-def test_relations_that_the_data_contradict_are_a_misfit(formulation: Formulation) -> None:
+def test_relations_that_the_data_contradict_are_a_lack_of_fit(formulation: Formulation) -> None:
     run = lotka_volterra().trajectory(noise=0.05, rng=0)
     recipe, library = Regression(formulation), polynomial(["x", "y"])
     right = discover(run, library.relate("x: x*y == -1"), recipe)
@@ -235,7 +235,7 @@ def test_a_state_whose_rows_cannot_be_whitened_leaves_the_others_tested(
     assert list(found.noise_test.left) == ["y"]
 
 
-def test_a_rule_that_judges_free_runs_says_a_misfit_where_others_do() -> None:
+def test_a_rule_that_assess_free_runs_says_a_lack_of_fit_where_others_do() -> None:
     run = replace(lotka_volterra(), rate_Hz=5.0).trajectory(noise=0.05, rng=0)
     rule = FreeRunScore(n_windows=4, n_folds=2)
     recipe = Regression(WeightedWeak(), BestSubset(max_terms=2), rule, Bootstraps(n=0))
@@ -264,7 +264,7 @@ def test_the_test_of_a_trajectory_search_is_not_that_of_another_model() -> None:
     assert "leaves white noise" in poor.lack_of_fit
 
 
-def test_samples_too_few_for_weak_rows_are_judged_by_none() -> None:
+def test_samples_too_few_for_weak_rows_are_assessed_by_none() -> None:
     run = lotka_volterra().trajectory(noise=0.05, rng=0)
     found = discover(run.window(0, 12), polynomial(["x", "y"], degree=1), PLAIN)
     assert found.lack_of_fit == ""
@@ -306,7 +306,7 @@ def test_white_noise_about_a_steady_course_is_no_law(recipe: AnyMethod) -> None:
     assert "too few" not in found.note
 
 
-def test_a_rest_is_judged_by_the_instants_at_which_all_was_measured() -> None:
+def test_a_rest_is_assessed_by_the_instants_at_which_all_was_measured() -> None:
     t, rng = np.arange(200.0), np.random.default_rng(2)
     states = np.stack([np.cos(0.7 * t), rng.standard_normal(200)], axis=1)
     missing = np.zeros((200, 2), dtype=np.bool_)

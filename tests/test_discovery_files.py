@@ -58,7 +58,7 @@ def test_a_constraint_that_was_stored_serves_a_refinement() -> None:
     assert one == other
 
 
-def test_rows_are_not_stored_and_who_needs_them_is_told() -> None:
+def test_rows_are_not_stored_and_who_needs_them_is_stated() -> None:
     again = ep.Discovery.from_json(found("bootstraps").to_json())
     assert again.estimate is None
     with pytest.raises(ValueError, match="a discovery that was stored keeps none"):
@@ -105,7 +105,7 @@ BAD: list[tuple[dict[str, Any], str]] = [
     ({"chosen": {"mapping": [["x", METHOD]]}}, "chosen of another kind"),
     # What Python itself says of a value without a part, or with one too many, names only code.
     ({"noise_test": {"class": "NoiseTest", "more": 1}}, "JSON: it is damaged, or of another kind"),
-    ({"remarks": 1}, "JSON: it is damaged, or of another kind"),
+    ({"data_warnings": 1}, "JSON: it is damaged, or of another kind"),
 ]
 
 

@@ -1,4 +1,4 @@
-"""Whether something outside drives a signal: inputs beside it, a known period, and the question."""
+"""Whether something outside drives a signal: inputs, a known period, and the question."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -68,7 +68,7 @@ def swept(f_Hz: float = 0.1387, n_periods: int = 40) -> tuple[np.ndarray, np.nda
     return t, sweep, x
 
 
-def test_a_phase_that_is_pushed_and_returns_is_asked_about() -> None:
+def test_a_phase_that_is_moved_by_process_noise_and_returns_is_asked_about() -> None:
     signal = prepare_signal(moved(forced, [0.0, 0.0], fraction=0.1, period_s=TURN / 0.9137))
     question = ask_whether_driven(signal, {})
     assert question is not None
@@ -87,9 +87,11 @@ def test_a_phase_that_walks_is_not(seed: int) -> None:
 def test_a_record_in_which_nothing_moves_tells_neither() -> None:
     signal = prepare_signal(moved(van_der_pol, [2.0, 0.0], fraction=0.0, n_periods=40))
     assert ask_whether_driven(signal, {}) is None
-    remark = report_unknown_drive(signal)
-    assert remark is not None
-    assert remark.startswith("this record does not tell whether x sustains itself or is driven")
+    data_warning = report_unknown_drive(signal)
+    assert data_warning is not None
+    assert data_warning.startswith(
+        "this record does not tell whether x sustains itself or is driven"
+    )
 
 
 def test_what_falls_between_coarse_samples_is_no_push() -> None:
@@ -135,7 +137,7 @@ def test_a_column_that_looks_set_is_named() -> None:
     assert ask_whether_driven(signal, {}) is None
     question = ask_whether_driven(signal, {"noise": (t, x[::-1]), "V": (t, sweep)})
     assert question is not None
-    assert "V beside it looks set (a triangle or a sweep)" in question
+    assert "V next to it looks set (a triangle or a sweep)" in question
     assert question.endswith("name it, inputs=[V]")
 
 
@@ -164,7 +166,7 @@ T = np.arange(1000) * 0.1
         (np.ones(1000), ""),
     ],
 )
-def test_what_somebody_sets_is_told_by_its_form(u: np.ndarray, how: str) -> None:
+def test_what_somebody_sets_is_stated_by_its_form(u: np.ndarray, how: str) -> None:
     assert describe_set(T, u, []) == how
 
 
@@ -246,7 +248,7 @@ def test_a_study_asks_whether_a_signal_is_driven_and_takes_the_column(tmp_path: 
     given += ["~data.variables", "trajectory.states=[x]", f"output={tmp_path}", "forecasts=0"]
     both = "+data.variables={x:{name:x,unit:1},V:{name:V,unit:1}}"
     asked = run_config(composed(*given, "+data.variables={x:{name:x,unit:1}}"))
-    assert "is x driven? It may be: V beside it looks set" in (asked / "run.log").read_text()
+    assert "is x driven? It may be: V next to it looks set" in (asked / "run.log").read_text()
     stated = run_config(composed(*given, both, "inputs=[V]"))
     assert "is x driven?" not in (stated / "run.log").read_text()
     assert set(summary_of(stated)["models"]["model"]["equations"]["x"]) == {"x", "V", "V^2"}

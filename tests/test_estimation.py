@@ -288,7 +288,7 @@ def test_a_near_miss_of_the_search_is_polished() -> None:
     assert is_right(ep.estimate([run], system.model.library).model, system)
 
 
-def test_prices_count_what_a_term_is_told_from() -> None:
+def test_prices_count_what_a_term_is_stated_from() -> None:
     problem, _ = lorenz_problem()
     names = [problem.library.names[c] for c in problem.column[:10]]
     penalties = dict(zip(names, term_penalties(problem, 100.0)[:10], strict=True))
@@ -347,7 +347,7 @@ def test_samples_that_a_fit_follows_exactly_show_no_noise_of_any_size() -> None:
     assert not shown.any()
 
 
-def test_lasting_noise_is_told_from_signal_and_buys_no_terms() -> None:
+def test_lasting_noise_is_stated_from_signal_and_buys_no_terms() -> None:
     system = ep.lorenz()
     found = ep.estimate([lasting(system.trajectory(), 0.05, 0.7, 0)], system.model.library)
     assert is_right(found.model, system)
@@ -355,7 +355,7 @@ def test_lasting_noise_is_told_from_signal_and_buys_no_terms() -> None:
     np.testing.assert_allclose(found.memory, 0.7, atol=0.06)
 
 
-def test_the_noise_is_measured_beside_the_model() -> None:
+def test_the_noise_is_measured_next_to_the_model() -> None:
     system = ep.systems.van_der_pol()
     run = system.trajectory(noise=0.2, rng=1)
     clean = system.trajectory()
@@ -392,14 +392,14 @@ def test_what_fits_comes_before_what_scores_lower(monkeypatch: pytest.MonkeyPatc
     assert is_right(found.model, system)
 
 
-def test_a_linear_library_of_what_is_not_linear_is_called_a_misfit() -> None:
+def test_a_linear_library_of_what_is_not_linear_is_called_a_lack_of_fit() -> None:
     run = ep.lotka_volterra().trajectory(noise=0.05, rng=0).window(0, 300)
     found = ep.estimate([run], ep.named_terms(["x", "y"], ["x", "y"]))
     assert found.lack_of_fit.startswith("this library lacks terms: with products up to degree 2")
     assert "libraries.model.degree=2" in found.lack_of_fit
 
 
-def test_an_equation_with_all_the_terms_that_it_may_have_is_a_misfit() -> None:
+def test_an_equation_with_all_the_terms_that_it_may_have_is_a_lack_of_fit() -> None:
     system = ep.lorenz()
     run, library = system.trajectory(noise=0.05, rng=0), system.model.library
     found = ep.estimate([run], library, max_terms=3)
@@ -523,7 +523,7 @@ def test_settings_of_a_given_search_hold_and_none_is_given_twice() -> None:
     assert method_with(deep, ep.discovery.Evidence(), 1) == deep
     assert method_with(ep.TrajectorySearch(), RULE, 2) == RULED
     assert method_with(RULED, ep.discovery.Evidence(), 2) == RULED
-    with pytest.raises(ValueError, match=r"must be set once, got .*search.depth\), and 2 beside"):
+    with pytest.raises(ValueError, match=r"must be set once, got .*search.depth\), and 2 next to"):
         method_with(deep, ep.discovery.Evidence(), 2)
     with pytest.raises(ValueError, match="search.selection.*; leave one of them out"):
         method_with(RULED, ep.FreeRunScore(n_folds=3), 1)
@@ -549,7 +549,7 @@ def test_what_cannot_be_estimated_is_refused_with_the_way_out() -> None:
         ep.estimate([run, run.window(0, 2)], ep.polynomial(["x", "y"], degree=2))
 
 
-def test_a_library_without_the_constant_where_a_state_drifts_is_a_misfit() -> None:
+def test_a_library_without_the_constant_where_a_state_drifts_is_a_lack_of_fit() -> None:
     rng = np.random.default_rng(0)
     t = np.linspace(0.0, 20.0, 100)
     states = np.column_stack([0.5 * t, np.cos(t)]) + 0.05 * rng.standard_normal((100, 2))
@@ -648,7 +648,7 @@ def test_more_coefficients_than_memory_holds_are_refused_first(
     cost.check_size([run], library, run_of_known_terms)
 
 
-def test_a_long_search_is_told_of_with_its_time() -> None:
+def test_a_long_search_is_stated_of_with_its_time() -> None:
     run, t = many_states(7), np.linspace(0.0, 900.0, 90_000)
     long = ep.Trajectory(t, np.tile(np.sin(t)[:, None], 7), run.state_names)
     large = ep.polynomial(run.state_names, degree=3)
@@ -666,7 +666,7 @@ def test_a_long_search_is_told_of_with_its_time() -> None:
 
 
 class Clock:
-    """A clock that goes on by a second whenever it is read."""
+    """A clock that continues by a second whenever it is read."""
 
     def __init__(self) -> None:
         self.read = 0
@@ -755,7 +755,7 @@ def test_what_is_found_in_a_part_of_a_record_says_so(monkeypatch: pytest.MonkeyP
     assert set(found.model.terms("x")) == {"x", "x*y"}
     n_taken = sum(each.n_samples for each in found.runs)
     assert n_taken <= run.n_samples // 3
-    assert f"the equations come from {n_taken} of {run.n_samples} samples" in found.remarks[0]
+    assert f"the equations come from {n_taken} of {run.n_samples} samples" in found.data_warnings[0]
     assert list(ep.estimate(run, library).runs) == [run]
 
 
@@ -775,7 +775,7 @@ def test_an_interruption_ends_a_search_that_is_watched() -> None:
         return advance
 
     found = ep.estimate(run, library, progress=interrupt(15))
-    assert "ended by an interruption after" in found.lack_of_fit + " ".join(found.remarks)
+    assert "ended by an interruption after" in found.lack_of_fit + " ".join(found.data_warnings)
     assert found.model.coef.any()
     steps = 0
     with pytest.raises(KeyboardInterrupt):
@@ -830,7 +830,7 @@ def test_process_noise_alone_is_no_law() -> None:
     assert found.lack_of_fit or found.model.coef.any(axis=0).all()
 
 
-def test_samples_that_leave_the_terms_open_are_said_to_tell_nothing() -> None:
+def test_samples_that_leave_the_terms_open_are_reported_to_tell_nothing() -> None:
     found = ep.estimate(SHORT["60 samples, 20 %"](0), LORENZ.model.library)
     assert re.match(
         r"60 samples do not tell these equations from others: the chance .* is \d+%",

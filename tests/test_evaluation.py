@@ -37,7 +37,7 @@ def record(n_periods: float = 40.0) -> Trajectory:
     return Trajectory(t, np.column_stack([np.cos(t), np.sin(t)]), ("x", "y"))
 
 
-def test_the_truth_lives_and_every_figure_is_exact() -> None:
+def test_the_truth_is_sustained_and_every_figure_is_exact() -> None:
     found = evaluate(hopf(), record())
     assert found.status is Status.SUSTAINED
     assert found.text == "sustained"
@@ -99,7 +99,7 @@ def test_units_change_nothing() -> None:
     assert found.waveform_error["y"] == pytest.approx(plain.waveform_error["y"], abs=1e-5)
 
 
-def test_chaos_is_judged_by_means_and_amplitudes() -> None:
+def test_chaos_is_assessed_by_means_and_amplitudes() -> None:
     system = replace(lorenz(), duration_s=60.0, rate_Hz=100.0)
     run = system.trajectory()
     truth = evaluate(system.model, run)
@@ -191,7 +191,7 @@ def test_of_several_records_the_worst_run_counts() -> None:
     assert worst_run([run, apart, run]) is apart
 
 
-def test_a_neutral_cycle_is_told_and_every_start_has_its_own() -> None:
+def test_a_neutral_cycle_is_stated_and_every_start_has_its_own() -> None:
     prey = lotka_volterra()
     found = evaluate(prey.model, prey.trajectory())
     assert found.cycle is not None
@@ -260,7 +260,7 @@ def test_only_what_is_asked_for_is_computed_and_once(monkeypatch: pytest.MonkeyP
     assert calls.count("forecast_skill") == calls.count("limit_cycle") == 1
 
 
-def test_of_a_line_of_rest_points_one_is_told() -> None:
+def test_of_a_line_of_rest_points_one_is_stated() -> None:
     run = record()
     beside = evaluate(model_of({"x": {"y": 1.0}, "y": {"y": -1.0}}), run, n_samples=200)
     (line,) = beside.rest_texts
@@ -269,7 +269,7 @@ def test_of_a_line_of_rest_points_one_is_told() -> None:
     assert far.rest_points == ()
 
 
-def test_a_run_that_left_is_not_told_in_its_size() -> None:
+def test_a_run_that_left_is_not_stated_in_its_size() -> None:
     assert [size_text(x) for x in (0.5, 100.0, 4.11e7)] == ["0.5", "100", "over 100"]
 
 

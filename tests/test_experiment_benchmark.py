@@ -48,7 +48,7 @@ def test_every_cell_is_counted(toy_run: Path) -> None:
     assert [c["mean_correct_terms"] for c in ours] == [4, 4, 3, 3]
 
 
-def test_the_thesis_stands_beside_our_cells(toy_run: Path) -> None:
+def test_the_thesis_stands_next_to_our_cells(toy_run: Path) -> None:
     table = pd.read_csv(toy_run / "tables" / "cells.csv")
     columns = ["thesis_on_front", "thesis_selected", "thesis_mean_correct_terms"]
     assert list(table.columns[-3:]) == columns

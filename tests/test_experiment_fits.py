@@ -158,7 +158,7 @@ def test_refinements_return_predator_and_prey(predator_prey: Path, tmp_path: Pat
     found.check_figures("loss_against_window", "phase", "spectra")
 
 
-def test_every_iteration_is_told_one_scalar_each() -> None:
+def test_every_iteration_is_stated_one_scalar_each() -> None:
     library = polynomial(["x", "y"], degree=2)
     held = constraint(library, {"x": ["x", "x*y"], "y": ["y", "x*y"]}, ["x: x*y == -1 * y: x*y"])
     stated: list[tuple[int, dict[str, float]]] = []

@@ -78,7 +78,7 @@ def test_breathing_finds_predator_and_prey(breathing_run: Path) -> None:
     assert set(summary["models"]) >= {"simple", "ionization", "velocity"} | refitted
 
 
-def test_breathing_ends_in_a_model_that_lives(breathing_run: Path) -> None:
+def test_breathing_ends_in_a_model_that_is_sustained(breathing_run: Path) -> None:
     found = summary_of(breathing_run)
     run, model = (found[key]["simple_living"] for key in ("evaluations", "models"))
     assert (
@@ -106,7 +106,7 @@ def test_breathing_ends_in_a_model_that_lives(breathing_run: Path) -> None:
         assert (breathing_run / "tables" / f"{table}.csv").is_file()
 
 
-def test_the_page_says_the_model_that_lives_before_candidates(breathing_run: Path) -> None:
+def test_the_page_says_the_model_that_is_sustained_before_candidates(breathing_run: Path) -> None:
     page = (breathing_run / "report.html").read_text()
     found, rest = page[page.index('id="found"') :].split("</section>", 1)
     assert "the cycle is neutral: it neither attracts nor repels" in found

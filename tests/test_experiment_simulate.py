@@ -146,7 +146,7 @@ def test_a_point_that_breaks_keeps_its_row_and_the_others_stand(scan: Path) -> N
 
 
 def test_a_scan_ends_where_its_runs_cannot_be_kept(tmp_path: Path) -> None:
-    """A full disk is not the fault of a point: it had a row `failed`, and the scan went on."""
+    """A full disk is not the fault of a point: it had a row `failed`, and the scan continued."""
     (tmp_path / "cache").write_text("a file, and no folder")
     config = composed(*toy(tmp_path), VOLTAGES)
     with pytest.raises(WriteError, match="cache could not be written"):
@@ -254,7 +254,7 @@ def test_curves_tell_statuses_by_markers() -> None:
         ({"mass_balance": 1.002}, "mass balance does not close: (out + stored)/in is 1.0020"),
     ],
 )
-def test_what_is_amiss_with_a_simulation_is_said(change: dict, message: str | None) -> None:
+def test_what_is_amiss_with_a_simulation_is_reported(change: dict, message: str | None) -> None:
     found = amiss(GOOD | change)
     assert len(found) == (message is not None)
     if message is not None:

@@ -48,7 +48,7 @@ def record(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return scope(tmp_path_factory.mktemp("scope") / "scope.csv", *signal(24.0))
 
 
-def test_hidden_states_that_are_a_misfit_are_shown_if_they_are_asked_for(tmp_path: Path) -> None:
+def test_hidden_states_that_are_a_lack_of_fit_are_shown_if_they_are_asked_for(tmp_path: Path) -> None:
     t = np.linspace(0.0, 50.0, 501)
     path = scope(tmp_path / "scope.csv", t, np.sin(t) ** 3)  # no linear equations make it
     found = computed(composed(*glance(path, tmp_path, "tried=[{how: hidden, degree: 1}]")))
@@ -58,7 +58,7 @@ def test_hidden_states_that_are_a_misfit_are_shown_if_they_are_asked_for(tmp_pat
     assert not found.summary["models"]["trace"]["intervals"]
 
 
-def test_one_column_of_a_file_becomes_a_model_that_lives(record: Path, tmp_path: Path) -> None:
+def test_one_column_of_a_file_becomes_a_model_that_is_sustained(record: Path, tmp_path: Path) -> None:
     folder = run_config(composed(*toy(record, tmp_path, "tried=[{how: rate}]")))
     summary = summary_of(folder)
     run = summary["evaluations"]["trace"]
@@ -134,7 +134,7 @@ def test_the_law_of_chaos_is_found_in_one_of_its_states(tmp_path: Path) -> None:
     assert max(found["forecasts"]["trace"]["nrmse"]["model"]) < 0.2
 
 
-def test_a_short_record_is_judged_on_all_of_it(tmp_path: Path) -> None:
+def test_a_short_record_is_assessed_on_all_of_it(tmp_path: Path) -> None:
     path = scope(tmp_path / "scope.csv", *signal(6.4))
     found = computed(composed(*glance(path, tmp_path, "held_out=0.2")))
     assert found.summary["signal"]["n_fitted"] == found.summary["data"]["n_samples"]

@@ -91,7 +91,7 @@ def test_a_time_column_may_be_called_by_its_unit(
     np.testing.assert_allclose(run.t, seconds * np.arange(40.0), rtol=1e-12)
 
 
-def test_a_column_of_years_beside_times_is_a_state() -> None:
+def test_a_column_of_years_next_to_times_is_a_state() -> None:
     table = pd.DataFrame({"t": np.arange(40.0), "year": RUN.states[:, 0]})
     (run,) = trajectories_of(table)
     assert run.state_names == ("year",)

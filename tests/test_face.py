@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 import ep2sindy as ep
-from ep2sindy._stubs import MARK, PACKAGE, dotted_names, read_stub, rooms
+from ep2sindy._stubs import MARK, PACKAGE, dotted_names, read_stub, subpackages
 from ep2sindy.app.targets import FOR_CONFIGS
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -17,7 +17,7 @@ STUBS = sorted((ROOT / PACKAGE).rglob("*.pyi"))
 
 
 def test_every_name_of_a_stub_is_loaded_as_it_says() -> None:
-    for room in rooms():
+    for room in subpackages():
         module = import_module(room)
         assert dir(module) == sorted(read_stub(room))
         for name, entry in read_stub(room).items():
@@ -26,7 +26,7 @@ def test_every_name_of_a_stub_is_loaded_as_it_says() -> None:
             home = value.__module__ if isinstance(value, type) else entry.module
             assert home == entry.module, f"{room}.{name} is defined elsewhere"
             assert name == entry.name, f"type checkers take {name} for no name of {room}"
-    assert len(STUBS) == len(rooms())
+    assert len(STUBS) == len(subpackages())
 
 
 def test_a_name_stands_in_one_stub_and_hides_no_module() -> None:

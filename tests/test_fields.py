@@ -89,7 +89,7 @@ def test_the_average_of_a_product_is_not_the_product_of_averages() -> None:
 
 
 def test_sums_and_products_of_float32_run_in_float64() -> None:
-    # In float32 the ones vanish beside 2^24, and 1e20 * 1e20 overflows.
+    # In float32 the ones vanish next to 2^24, and 1e20 * 1e20 overflows.
     values = np.ones((11, 1001), np.float32)
     values[:, 0] = 2**24 * np.arange(1, 12)
     field = field_of(np.arange(1001), n_i=(("time", "z"), values)).astype(np.float32)

@@ -97,7 +97,7 @@ def test_a_pattern_is_proposed_where_names_differ_in_numbers(
         ("runs/a.csv", "need a pattern with a placeholder for each quantity, like 'runs/V"),
         ("runs/{a b}.csv", "a placeholder must be the name of a quantity, .*, got 'a b'"),
         ("runs/{data}.csv", "a placeholder must be .* and not 'data', .*, got 'data'"),
-        ("runs/W{V}.csv", r"no file fits .* 1 files beside it: runs/V1.csv \.\.\."),
+        ("runs/W{V}.csv", r"no file fits .* 1 files next to it: runs/V1.csv \.\.\."),
     ],
 )
 def test_a_pattern_that_cannot_be_is_refused(text: str, message: str, here: Path) -> None:
@@ -157,7 +157,7 @@ def test_files_make_a_law_over_the_quantity_of_their_names(here: Path) -> None:
     assert stated in " ".join(found.log.split())
 
 
-def test_a_law_of_which_no_point_lives_says_what_to_try(here: Path) -> None:
+def test_a_law_of_which_no_point_is_sustained_says_what_to_try(here: Path) -> None:
     swing(here, 0.6, 0.9, 1.2)
     found = predicted(here, "{n_i: [n_i,'n_i^3'], n_n: [n_i]}")
     (advice,) = [text for text in found.warnings if "is sustained by the law" in text]

@@ -75,12 +75,12 @@ def test_paths_part_by_twice_the_positive_exponents(rate: float, expected: float
     assert divergence_rate(fit) == pytest.approx(expected, abs=0.05)
 
 
-def test_a_model_that_could_follow_any_samples_is_a_misfit() -> None:
+def test_a_model_that_could_follow_any_samples_is_a_lack_of_fit() -> None:
     run = ep.lotka_volterra().trajectory(noise=0.05, rng=0).window(0, 400)
     problem = scale_problem([run], ep.polynomial(run.state_names, degree=2))
     found = from_smooth(problem, None)
     assert found.fits
-    (apart,) = [test for test in found.tests if "paths beside" in test.words]
+    (apart,) = [test for test in found.tests if "paths next to" in test.words]
     assert (apart.statistic < np.exp(0.05 / 2.0)).all()
     diverging = replace(found, tests=(replace(apart, statistic=np.full(2, np.exp(4.0 / 2.0))),))
     assert not diverging.fits

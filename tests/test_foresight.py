@@ -37,7 +37,7 @@ def test_a_line_that_noise_drives_is_linear_and_chaos_is_not() -> None:
     assert not is_linear(trace_of(chaos(), 0.04))
 
 
-def test_of_few_turns_and_of_a_period_nothing_is_said() -> None:
+def test_of_few_turns_and_of_a_period_nothing_is_reported() -> None:
     assert not is_linear(trace_of(line_in_noise(300)))
     assert not is_linear(trace_of(np.sin(2.0 * np.pi * np.arange(1000) / 40.0)))
 
@@ -59,7 +59,7 @@ def test_a_positive_signal_that_is_linear_has_a_derivative_and_no_rate() -> None
     assert attempt.is_damped_line
 
 
-def test_what_is_told_holds_in_the_library_of_every_preparation_that_has_it() -> None:
+def test_what_is_stated_holds_in_the_library_of_every_preparation_that_has_it() -> None:
     states = ep.embed(trace_of(np.sin(np.arange(600) / 6.0)), "derivative")
     stated = StatedFacts(
         exclude={"v": ["x^2", "x^5"], "g": ["x"]},

@@ -94,7 +94,7 @@ def test_a_state_that_was_not_measured_need_not_keep_its_waveform(found):
         ep.evaluate(found.model, run, assessed=["T"])
 
 
-def test_starts_at_other_phases_refuse_what_lives_from_one(found):
+def test_starts_at_other_phases_refuse_what_is_sustained_from_one(found):
     several = ep.discover(record(), LIBRARY, recipe(n_starts=4))
     assert several.note.startswith("sustained, ")
     for state in ("n_i", "n_n"):
@@ -111,7 +111,7 @@ def test_noise_that_more_terms_follow_does_not_make_a_cycle_attract():
         assert list(found.model.terms(state)) == list(PREY.model.terms(state))
 
 
-def test_where_nothing_lives_the_best_comes_back_with_its_verdict():
+def test_where_nothing_is_sustained_the_best_comes_back_with_its_verdict():
     dead = ep.discover(record(), LIBRARY, recipe(max_terms=1, n_best=1))
     assert dead.note.endswith("; none of 4 systems are sustained where not fitted")
     assert not dead.note.startswith("sustained")
@@ -125,7 +125,7 @@ def test_where_nothing_lives_the_best_comes_back_with_its_verdict():
         (ep.systems.damped_oscillator().trajectory(), "record 'damped oscillator' has no period"),
     ],
 )
-def test_a_record_without_a_cycle_is_judged_by_windows(run, reason):
+def test_a_record_without_a_cycle_is_assessed_by_windows(run, reason):
     library = ep.polynomial(run.state_names, degree=2)
     other = ep.discover(run, library, recipe(max_terms=3, n_best=1))
     assert re.match(reason, other.note)

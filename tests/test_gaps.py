@@ -25,7 +25,7 @@ GAPPY = Trajectory(
 HALVES = [GAPPY.window(0, FIRST), GAPPY.window(FIRST, GAPPY.n_samples)]
 
 
-def test_a_gap_is_a_step_far_longer_than_those_beside_it() -> None:
+def test_a_gap_is_a_step_far_longer_than_those_next_to_it() -> None:
     assert between_gaps(GAPPY.t) == [(0, FIRST), (FIRST, GAPPY.n_samples)]
     t = np.concatenate([np.arange(50.0), [80.0], 120.0 + np.arange(50.0)])  # one sample alone
     assert between_gaps(t) == [(0, 50), (50, 51), (51, 101)]
@@ -61,7 +61,7 @@ def test_samples_that_stand_alone_between_gaps_are_left_out_and_counted() -> Non
     run = Trajectory(WHOLE.t[lonely], WHOLE.states[lonely], WHOLE.state_names)
     found = ep.estimate(run, LV.library)
     words = "1 of 701 samples are left out: fewer than 5 stand together between gaps"
-    assert words in found.remarks
+    assert words in found.data_warnings
     assert len(found.paths[0]) == found.runs[0].n_samples == 700
 
 
@@ -72,7 +72,7 @@ def test_a_record_of_nothing_but_bursts_is_taken_as_it_was_sampled() -> None:
     assert len(record.samples) == run.n_samples
 
 
-def test_a_hidden_state_is_found_beside_a_gap() -> None:
+def test_a_hidden_state_is_found_next_to_a_gap() -> None:
     prey = Trajectory(GAPPY.t, GAPPY.columns(["x"]), ["x"])
     found = ep.discover(prey, hidden=["g"])
     assert list(found.model.terms("g")) == ["1", "x", "g", "x*g"]
@@ -152,7 +152,7 @@ def test_refinement_takes_windows_between_gaps_alone() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["gap5x1", "gap5x3", "gap10x1", "gap20x3", "gap30x1", "gap30x3"])
 @pytest.mark.parametrize("name", ["lorenz", "lotka_volterra", "van_der_pol", "fitzhugh_nagumo"])
-def test_equations_are_found_beside_gaps_as_without(name: str, kind: str) -> None:
+def test_equations_are_found_next_to_gaps_as_without(name: str, kind: str) -> None:
     for number in range(3):
         system, run = noisy(name, 0.05, number, kind)
         found = ep.estimate(run, system.model.library)

@@ -125,7 +125,7 @@ TIMES, SAMPLES = PREY.t, PREY.states
     ],
     ids=["array", "step", "table", "table and step", "table in ms", "Dataset in ms"],
 )
-def test_times_come_with_samples_or_beside_them(runs: object, given: dict) -> None:
+def test_times_come_with_samples_or_next_to_them(runs: object, given: dict) -> None:
     (run,) = trajectories_of(runs, **given)
     np.testing.assert_allclose(run.t, TIMES, rtol=1e-12, atol=1e-12)
     np.testing.assert_array_equal(run.states, SAMPLES)

@@ -78,7 +78,7 @@ def test_the_tutorial_has_the_defaults_that_its_stored_run_names(folder: Path) -
     assert (run.reconstruct, run.coldest_T_e_eV) == (True, 1.5)
 
 
-def test_the_field_is_read_from_beside_the_file_in_m_and_T(folder: Path) -> None:
+def test_the_field_is_read_from_next_to_the_file_in_m_and_T(folder: Path) -> None:
     field = read(folder, changed(magnetic_field_scale=2.0)).thruster.magnetic_field
     np.testing.assert_allclose(
         field.at(Z - 0.025), 0.04 * np.exp(-(((Z - 0.025) / 0.012) ** 2)), rtol=1e-12
@@ -187,7 +187,7 @@ def test_ingestion_takes_the_number_in_Torr_for_one_in_Pa(folder: Path) -> None:
     assert still.background is None
 
 
-def test_what_stands_beside_a_list_of_propellants_is_not_read(folder: Path) -> None:
+def test_what_stands_next_to_a_list_of_propellants_is_not_read(folder: Path) -> None:
     """HallThruster.jl runs such files at 150 m/s: u of the neutrals in ref_spt100_baseline."""
     beside = {"neutral_velocity": 278.0, "neutral_temperature_K": 300.0, "ion_temperature_K": 1.0}
     assert read(folder, changed(**beside)) == read(folder, TUTORIAL)

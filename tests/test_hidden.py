@@ -42,7 +42,9 @@ def test_the_law_of_one_species_alone(found: ep.Discovery) -> None:
     assert own == pytest.approx(GROWTH, rel=0.05)
     held = [low <= GROWTH[term] <= high for term, (low, high) in found.model.intervals("g").items()]
     assert sum(held) >= 3
-    assert "g was not measured: its scale is such that x' has the term x*g" in found.remarks[0]
+    assert (
+        "g was not measured: its scale is such that x' has the term x*g" in found.data_warnings[0]
+    )
 
 
 def test_the_hidden_state_is_what_it_stands_for(found: ep.Discovery) -> None:

@@ -221,7 +221,7 @@ def test_a_scalar_may_say_the_step(tmp_path: Path, name: str, value: float) -> N
 
 
 @pytest.mark.parametrize(("factor", "unit"), [(1.0, "s"), (1e3, "ms"), (1e6, "us"), (7.0, "s")])
-def test_a_rate_beside_a_time_says_its_unit(tmp_path: Path, factor: float, unit: str) -> None:
+def test_a_rate_next_to_a_time_says_its_unit(tmp_path: Path, factor: float, unit: str) -> None:
     savemat(tmp_path / "a.mat", {"signal": WAVE[:, 0, 0], "t": factor * T, "fs": 1 / 1.5e-6})
     assert ep.inspect_file(tmp_path / "a.mat").time == ep.data.Variable("t", unit)
 
@@ -280,7 +280,7 @@ def test_plain_columns_in_json_are_a_record(tmp_path: Path) -> None:
     assert field["I_d"].attrs["units"] == "A"
 
 
-def test_all_that_is_wrong_with_a_mapping_is_told_at_once(tmp_path: Path) -> None:
+def test_all_that_is_wrong_with_a_mapping_is_stated_at_once(tmp_path: Path) -> None:
     np.savez(tmp_path / "a.npz", t=T, z=Z, ni=N_I[:, :, 0], Te=T_E[:10, :, 0])
     with pytest.raises(ValueError, match="4 things must be put right") as caught:
         ep.open_field(
@@ -354,7 +354,7 @@ def test_a_folder_says_the_way(tmp_path: Path, files: list[str], stated: str) ->
         ep.inspect_file(tmp_path / "runs")
 
 
-def test_times_rounded_to_few_digits_are_equal_steps_and_said(tmp_path: Path) -> None:
+def test_times_rounded_to_few_digits_are_equal_steps_and_reported(tmp_path: Path) -> None:
     t = 99.0 + 0.35 * np.arange(NT)
     path = tmp_path / "a.csv"
     rows = [f"{a:.2E},{b:.4f}" for a, b in zip(t, WAVE[:, 0, 0], strict=True)]
@@ -368,7 +368,7 @@ def test_times_rounded_to_few_digits_are_equal_steps_and_said(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("mark", [9.91e37, 9.9e37, 1e30, -999.0, -9999.0, 32767.0])
-def test_marks_of_overload_that_repeat_are_missing_samples_and_said(
+def test_marks_of_overload_that_repeat_are_missing_samples_and_reported(
     tmp_path: Path, mark: float
 ) -> None:
     x = WAVE[:, 0, 0].copy()

@@ -27,7 +27,7 @@ from ep2sindy.systems.systems import System
 def noise_of(
     runs: list[ep.Trajectory], paths: list[np.ndarray], library: ep.Library | None = None
 ) -> Noise:
-    """The noise beside given paths, in SI, of a model of no terms."""
+    """The noise next to given paths, in SI, of a model of no terms."""
     problem = scale_problem(runs, library or ep.polynomial(runs[0].state_names, degree=2))
     path, none = np.concatenate(paths) / problem.scale, np.zeros(problem.n_free)
     return noise_beside(TrajectoryFit(problem, np.ones(path.shape), 1.0, path, none, none > 0.0))
@@ -123,8 +123,8 @@ def test_what_lasts_about_a_rest_has_a_law(memory: float) -> None:
 
 
 @pytest.mark.parametrize("memory", [0.0, 0.7])
-def test_a_line_in_what_is_left_beside_a_path_is_a_misfit(memory: float) -> None:
-    """Beside noise of the same size, white or AR(1), in 200 records: Fisher's chance is 1e-5."""
+def test_a_line_in_what_is_left_next_to_a_path_is_a_lack_of_fit(memory: float) -> None:
+    """Next to noise of the same size, white or AR(1), in 200 records: Fisher's chance is 1e-5."""
     rng, n, called = np.random.default_rng(1), 300, np.zeros(2, dtype=np.int64)
     t = np.arange(float(n))
     path = 5.0 * np.cos(0.31 * t + np.array([[0.0], [1.0]])).T
@@ -240,10 +240,10 @@ def test_process_noise_may_keep_up_what_would_die_out() -> None:
     assert try_open_loop(fit, np.full(2, 0.01), with_process_noise, start=small).passes.all()
 
 
-def test_a_delay_is_told_with_its_error() -> None:
+def test_a_delay_is_stated_with_its_error() -> None:
     run = spoilt("lotka_volterra", "lag 2", 0, 0.02)[1]
     found = ep.estimate([run], ep.polynomial(["x", "y"], degree=2))
-    stated = re.search(r"y comes \S+ s late \((\S+) ± (\S+) samples\)", found.lack_of_fit)
+    stated = re.search(r"y lags by \S+ s \((\S+) ± (\S+) samples\)", found.lack_of_fit)
     assert stated is not None
     assert abs(float(stated[1]) - 2.0) < 2.0 * float(stated[2])
 

@@ -1,4 +1,4 @@
-"""The house rule: imports go one way, rooms stay small, and heavy guests stay in their rooms."""
+"""Imports go one way, subpackages stay small, and each heavy dependency stays in its own."""
 
 import ast
 from collections import Counter
@@ -10,7 +10,7 @@ from runpy import run_path
 import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "ep2sindy"
-# From the ground up: a room may import only from itself and from those before it.
+# From the ground up: a subpackage may import only from itself and from those before it.
 ROOMS = [
     "_stubs",
     "parallel",  # a stub alone
@@ -66,7 +66,7 @@ MODULES = sorted(path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__
 
 
 def named(path: Path) -> str:
-    """`search/front.py` -> `search.front`; a room's `__init__.py` bears the room's name."""
+    """`search/front.py` -> `search.front`; an `__init__.py` bears its subpackage's name."""
     parts = path.relative_to(PACKAGE).with_suffix("").parts
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
@@ -161,7 +161,7 @@ def test_heavy_packages_load_only_where_they_are_needed(package: str) -> None:
     assert not heavy, "\n".join(heavy)
 
 
-def test_every_room_is_on_the_list() -> None:
+def test_every_subpackages_is_on_the_list() -> None:
     assert {module.split(".")[0] for module in PATHS} <= set(ROOMS)
 
 
@@ -193,6 +193,8 @@ def test_a_class_name_stands_once() -> None:
     assert twice == {"Study"}
 
 
-def test_the_drawing_of_the_house_is_what_the_imports_say() -> None:
-    house = run_path(str(PACKAGE.parent / "docs" / "house.py"))
-    assert house["DRAWING"].read_text("utf-8") == house["drawing"](), "run python docs/house.py"
+def test_the_drawing_of_the_structure_is_what_the_imports_say() -> None:
+    structure = run_path(str(PACKAGE.parent / "docs" / "structure.py"))
+    assert structure["DRAWING"].read_text("utf-8") == structure["drawing"](), (
+        "run python docs/structure.py"
+    )

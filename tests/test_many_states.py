@@ -70,5 +70,5 @@ def test_every_model_of_a_list_keeps_its_own_constraint() -> None:
     np.testing.assert_allclose(together[0].model.coef, alone.model.coef, rtol=1e-8)
     with pytest.raises(ValueError, match=r"one entry per model.* 2 for 3 models$"):
         ep.refine([model] * 3, [[run]] * 3, constraints=known, seed=0)
-    with pytest.raises(ValueError, match="beside a common one; leave out one$"):
+    with pytest.raises(ValueError, match="next to a common one; leave out one$"):
         ep.refine([model] * 2, [[run]] * 2, constraint=known[0], constraints=known, seed=0)

@@ -1,4 +1,4 @@
-"""Channels of their own rates, equations that hold beside others, and states that are missing."""
+"""Channels of their own rates, equations that hold next to others, and states that are missing."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def test_a_slow_channel_is_taken_as_it_was_measured() -> None:
     run = LORENZ.trajectory(noise=0.1, rng=0)
     found = ep.estimate(every_third(run), LIBRARY)
     assert not found.lack_of_fit
-    assert found.remarks == ("z was measured at 1000 of 3000 samples",)
+    assert found.data_warnings == ("z was measured at 1000 of 3000 samples",)
     for state in run.state_names:
         assert set(found.model.terms(state)) == set(LORENZ.model.terms(state))
     true_std = 0.1 * np.sqrt(np.square(LORENZ.trajectory().states).mean(axis=0))
@@ -108,7 +108,7 @@ def test_a_regression_needs_two_complete_samples() -> None:
         ep.discover(run, ep.polynomial(["x", "y"], degree=1), ep.Regression())
 
 
-def test_an_equation_that_is_closed_holds_beside_one_that_is_not() -> None:
+def test_an_equation_that_is_closed_holds_next_to_one_that_is_not() -> None:
     """Lorenz without z: x' = 10 (y - x) needs no z, and y' does."""
     run = LORENZ.trajectory(noise=0.05, rng=0).window(0, 1500)
     two = ep.Trajectory(run.t, run.states[:, :2], ["x", "y"])

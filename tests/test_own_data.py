@@ -197,7 +197,7 @@ def test_a_gap_leaves_the_step_as_it_is(folder: Path, capsys: pytest.CaptureFixt
         ("t", np.arange(50.0), 0.02, ""),  # counts the samples
     ],
 )
-def test_a_step_that_contradicts_the_files_times_is_told(
+def test_a_step_that_contradicts_the_files_times_is_stated(
     folder: Path, header: str, times: np.ndarray, dt_s: float, stated_s: str
 ) -> None:
     rows = "\n".join(f"{t:.9g},{k % 7}" for k, t in enumerate(times))
@@ -213,7 +213,7 @@ def test_a_step_that_contradicts_the_files_times_is_told(
         assert f"'t', which go in steps of {stated_s} s" in text
 
 
-def test_a_step_that_contradicts_a_mapping_is_told(folder: Path) -> None:
+def test_a_step_that_contradicts_a_mapping_is_stated(folder: Path) -> None:
     lorenz_csv(folder / "a.csv")
     mapping = {"variables": {"x": ep.data.Variable("x", "1")}, "dt_s": 3.0}
     with pytest.warns(DoubtfulUnit, match="dt_s=3 is taken"):

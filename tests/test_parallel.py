@@ -99,7 +99,7 @@ def test_rows_come_in_the_order_of_their_pieces() -> None:
         rows_in_order(Serial(), repeated, [0], "piece")
 
 
-def test_results_come_in_the_order_of_their_pieces_and_are_told_as_they_come() -> None:
+def test_results_come_in_the_order_of_their_pieces_and_are_stated_as_they_come() -> None:
     advanced: list[int] = []
     stated: list[tuple[int, list[int]]] = []
     results = collect(

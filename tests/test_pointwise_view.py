@@ -18,7 +18,7 @@ TERMS = {"1": "m^-3 s^-1", "n_n": "s^-1", "n_i*u_iz": "m^-1"}
 def study() -> xr.Dataset:
     """12 points: n_i' = -40 n_i u_iz, but 0 at two of them; n_n' = 10^22..10^23 or 3e4 n_n.
 
-    A quarter of the points with n_n has a small constant beside it. The last point is no plasma.
+    A quarter of the points with n_n has a small constant next to it. The last point is no plasma.
     """
     coef, weight = np.zeros((2, 2, 3, 12))
     coef[0, 2], weight[0, 2] = -40.0, -1.0

@@ -259,7 +259,7 @@ def test_a_gas_has_its_range_and_its_own_table(tmp_path: Path) -> None:
         ionization_rate(hot, gas="krypton")
     with pytest.raises(ValueError, match="there are the propellants .*, got 'neon'"):
         ionization_rate(precompile(), gas="neon")
-    with pytest.raises(ValueError, match="got gas='argon' beside"):
+    with pytest.raises(ValueError, match="got gas='argon' next to"):
         ionization_rate(precompile(), gas="argon", table=tmp_path / "rates.csv")
 
 

@@ -43,7 +43,7 @@ def counted(system: System, degree: int, seeds: range) -> tuple[int, int, int]:
             set(found.model.terms(s)) != set(truth.terms(s)) for s in truth.states
         ):
             continue
-        assert "process noise moves the states" in found.remarks[0]
+        assert "process noise moves the states" in found.data_warnings[0]
         right += 1
         for state in truth.states:
             for term, (low, high) in found.model.intervals(state).items():
@@ -92,7 +92,7 @@ def test_what_a_library_lacks_is_no_process_noise(noise: float) -> None:
 
 
 @pytest.mark.slow  # an equation without one of its states is stated so in the fast suite
-def test_an_equation_that_lacks_no_term_is_told_from_one_that_does() -> None:
+def test_an_equation_that_lacks_no_term_is_stated_from_one_that_does() -> None:
     """x' lacks x^3, and the linear y' is right."""
     run = VAN_DER_POL.trajectory(noise=0.05, rng=0)
     found = ep.estimate(run, ep.polynomial(run.state_names, degree=2))

@@ -134,7 +134,7 @@ def test_a_terminal_sees_label_count_and_unit_and_then_nothing(
     assert not terminal.getvalue().split("\r")[-2].strip()
 
 
-def test_true_means_bars_and_a_function_is_told() -> None:
+def test_true_means_bars_and_a_function_is_stated() -> None:
     assert as_progress(True) == Bars()
     assert as_progress(False) is SILENT
     watch, numbers = Recorder(), []

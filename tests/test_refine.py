@@ -323,7 +323,7 @@ def test_start_that_blows_up_is_a_result() -> None:
 
 
 @pytest.mark.parametrize("method", [MultipleShooting(), SingleShooting()])
-def test_models_of_different_terms_are_refined_and_judged_as_if_alone(method: Method) -> None:
+def test_models_of_different_terms_are_refined_and_assessed_as_if_alone(method: Method) -> None:
     rng = np.random.default_rng(0)
     library = PREY.model.library
     terms = [PREY.model.terms(state) for state in PREY.model.states]

@@ -155,7 +155,7 @@ def test_of_dependent_terms_the_simplest_are_kept() -> None:
     ]
 
 
-def test_the_user_is_told_what_cannot_be_told_apart() -> None:
+def test_the_user_is_stated_what_cannot_be_stated_apart() -> None:
     messages = [a.message for a in ambiguities(degenerate())]
     assert "'zero' is zero on every row and is left out" in messages
     assert "'minus_3a' is a multiple of 'a' on every row and is left out" in messages

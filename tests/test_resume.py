@@ -1,4 +1,4 @@
-"""Runs that are broken off go on with their finished pieces, and find the same to the last bit."""
+"""Interrupted runs continue with their finished pieces, and find the same to the last bit."""
 
 import os
 from collections.abc import Callable
@@ -88,7 +88,7 @@ def ends(*_: object, **settings: object) -> None:
 def broken_and_resumed(
     monkeypatch: pytest.MonkeyPatch, config: DictConfig, *, after: int
 ) -> Computed:
-    """A run that ends after some pieces, as by Ctrl-C, and goes on: those are not done again."""
+    """A run that ends after some pieces, as by Ctrl-C, and continues: those are not done again."""
     read_or_do, begun = parallel.kept, list[Any]()
 
     def last(folder: Path, piece: tuple[int, int], function: Callable, value: Any) -> Any:

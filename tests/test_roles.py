@@ -155,7 +155,7 @@ def amounts_of(found) -> list:
     return process_amounts(found.constraint, {s: found.model.terms(s) for s in STATES})
 
 
-def test_what_is_told_is_kept_beside_what_is_found(record):
+def test_what_is_stated_is_kept_next_to_what_is_found(record):
     """n_n leaves by S + B, stated as an outflow and a seed: only the seed is to be found."""
     stated = {"n_n out": {"n_n": B}, "n_n in": {"1": M}, "n_i out": {"n_i": A}}
     roles = ep.Roles(

@@ -118,7 +118,7 @@ def test_the_order_of_rows_and_terms_leaves_the_choice_of_a_rule(
 def test_a_column_that_says_nothing_new_is_in_no_candidate(
     search: Search, exact: Rows, where: int, kind: str
 ) -> None:
-    """Zeros, a multiple of the next column, or one number throughout, beside exact rows."""
+    """Zeros, a multiple of the next column, or one number throughout, next to exact rows."""
     theta = exact.theta.copy()
     theta[:, where] = {"zero": 0.0, "double": 2.0 * theta[:, where - 1], "constant": 4.0}[kind]
     damaged = Rows(theta, theta @ exact.coef, exact.coef)

@@ -46,7 +46,7 @@ def test_what_limits_say_is_the_normal_distribution_between_them(
     lower: float, upper: float
 ) -> None:
     mean, tells, squares = (float(v[0]) for v in between(np.array([lower]), np.array([upper])))
-    # Beside its highest density there, so that far tails do not vanish.
+    # Next to its highest density there, so that far tails do not vanish.
     top = min(max(0.0, lower), upper)
     start, end = max(lower, top - 12.0), min(upper, top + 12.0)
     peak = norm.logpdf(top)
@@ -72,7 +72,7 @@ def clipped_problem() -> tuple[EstimationProblem, System]:
     return scale_problem([run], system.model.library), system
 
 
-def test_residuals_beside_limits_are_the_slope_of_what_is_least() -> None:
+def test_residuals_next_to_limits_are_the_slope_of_what_is_least() -> None:
     problem, _ = clipped_problem()
     (record,) = problem.records
     rng = np.random.default_rng(0)
@@ -88,7 +88,7 @@ def test_residuals_beside_limits_are_the_slope_of_what_is_least() -> None:
     )
 
 
-def test_a_clipped_top_is_found_and_values_beside_it_stay() -> None:
+def test_a_clipped_top_is_found_and_values_next_to_it_stay() -> None:
     rng = np.random.default_rng(0)
     x = np.sin(np.linspace(0.0, 40.0, 500)) + 0.01 * rng.standard_normal(500)
     cut = np.column_stack([np.minimum(x, 0.9), x])
@@ -144,7 +144,7 @@ def test_samples_at_their_limits_do_not_lead_astray(kind: str) -> None:
     found = ep.discover(run, system.model.library)
     np.testing.assert_array_equal(found.model.coef != 0.0, system.model.coef != 0.0)
     assert not found.lack_of_fit
-    assert any("read as limits, not as values" in each for each in found.remarks)
+    assert any("read as limits, not as values" in each for each in found.data_warnings)
     std = np.sqrt(np.diag(found.model.covariance))  # type: ignore[arg-type]
     used = system.model.coef.T != 0.0
     off = (found.model.coef - system.model.coef).T[used] / std
@@ -154,7 +154,7 @@ def test_samples_at_their_limits_do_not_lead_astray(kind: str) -> None:
 def test_a_regression_says_that_it_takes_limits_for_values() -> None:
     system, run = spoilt("van_der_pol", "clip 80", 0, 0.02)
     found = ep.discover(run, system.model.library, ep.Regression(ep.WeightedWeak()))
-    assert "rows take them for values; TrajectorySearch()" in found.remarks[0]
+    assert "rows take them for values; TrajectorySearch()" in found.data_warnings[0]
     assert "note: x is clipped" in repr(found)
 
 
@@ -182,7 +182,7 @@ def fit_of_samples(problem: EstimationProblem, system: System) -> TrajectoryFit:
     )
 
 
-def test_delays_are_found_to_second_order_beside_the_true_equations() -> None:
+def test_delays_are_found_to_second_order_next_to_the_true_equations() -> None:
     errors = []
     for size in (0.2, 0.1):
         delays = (0.0, size, -0.5 * size)
@@ -217,7 +217,7 @@ def test_moved_samples_are_those_of_the_time_they_belong_to() -> None:
     np.testing.assert_allclose(found.samples * late.scale, expected, atol=2e-3)
 
 
-def test_a_late_channel_is_said_and_brought_forward_on_request() -> None:
+def test_a_delayed_channel_is_reported_and_brought_forward_on_request() -> None:
     system, run = spoilt("lotka_volterra", "lag 2", 0, 0.02)
     run = run.window(0, 500)
     found = ep.discover(run, system.model.library)
@@ -228,7 +228,7 @@ def test_a_late_channel_is_said_and_brought_forward_on_request() -> None:
     assert not aligned.lack_of_fit
     assert aligned.estimate is not None
     assert aligned.estimate.delays_s[1] == pytest.approx(2.0 * run.dt_s, rel=0.05)
-    assert "brought together with the others" in aligned.remarks[0]
+    assert "brought together with the others" in aligned.data_warnings[0]
 
 
 def test_the_first_channel_may_be_the_late_one() -> None:
@@ -247,17 +247,17 @@ def test_the_first_channel_may_be_the_late_one() -> None:
     ("kind", "word"),
     [("outliers", "outliers beyond five"), ("multiplicative", "grows with"), ("AR 0.95", "lasts")],
 )
-def test_noise_that_is_not_as_assumed_is_told(kind: str, word: str) -> None:
+def test_noise_that_is_not_as_assumed_is_stated(kind: str, word: str) -> None:
     system, run = spoilt("lotka_volterra", kind, 0, 0.02)
     found = ep.discover(run, system.model.library)
-    assert any(word in each for each in found.remarks)
+    assert any(word in each for each in found.data_warnings)
 
 
 @pytest.mark.parametrize("name", ["lorenz", "van_der_pol", "lotka_volterra"])
 def test_white_and_normal_noise_is_not_spoken_of(name: str) -> None:
     system, run = spoilt(name, "none", 0, 0.05)
     found = ep.discover(run, system.model.library)
-    assert found.remarks == ()
+    assert found.data_warnings == ()
     assert found.estimate is not None
     np.testing.assert_allclose(found.estimate.kurtosis, 3.0, atol=0.6)
     assert not found.estimate.delays_s.any()
@@ -283,7 +283,7 @@ def test_states_that_hang_together_but_for_their_noise_are_named() -> None:
     second = run.states[:, 0] + 0.02 * rng.standard_normal(run.n_samples)
     both = ep.Trajectory(run.t, np.column_stack([run.states, second]), ["x", "y", "z"])
     found = ep.discover(both, ep.polynomial(["x", "y", "z"], degree=1))
-    assert any("x and z hang together: 1 x -" in each for each in found.remarks)
+    assert any("x and z hang together: 1 x -" in each for each in found.data_warnings)
 
 
 def test_samples_that_two_runs_share_are_refused() -> None:

@@ -1,4 +1,4 @@
-"""Figures of models beside the data: what every panel must hold."""
+"""Figures of models next to the data: what every panel must hold."""
 
 from unittest.mock import Mock
 

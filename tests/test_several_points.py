@@ -184,7 +184,7 @@ def test_terms_taken_in_by_chance_at_single_points_are_dropped() -> None:
     assert terms_in(searched(rows, selection=BIC)) == ("a", "b", "c")
 
 
-def test_terms_that_repeat_each_other_at_one_point_are_told_apart_by_another() -> None:
+def test_terms_that_repeat_each_other_at_one_point_are_stated_apart_by_another() -> None:
     rows = {p: rows_of({"b": 1.0}, seed=k, noise=0.1) for k, p in enumerate((1.0, 2.0))}
     alike = rows[1.0].theta.copy()
     alike[:, 0] = 3.0 * alike[:, 1]
@@ -434,7 +434,7 @@ def test_relations_and_known_coefficients_are_exact_at_points_and_in_laws(
     assert "exact: n_n: 1 == 0.015 * mdot_mgs" in repr(found)
 
 
-def test_terms_that_are_told_are_those_of_every_point() -> None:
+def test_terms_that_are_stated_are_those_of_every_point() -> None:
     runs, terms = family(0.05, 3), {state: list(own) for state, own in TRUTH.items()}
     found = ep.discover(runs, LIBRARY.only(terms), METHOD, law=1)
     for own in found.points.values():

@@ -209,7 +209,7 @@ def test_an_exchange_takes_the_terms_that_are_named() -> None:
     assert not any(p.one_sign for p in found)
 
 
-def test_processes_of_zones_stand_beside_what_the_record_exchanged(field, zones, run) -> None:
+def test_processes_of_zones_stand_next_to_what_the_record_exchanged(field, zones, run) -> None:
     """A model of made-up rates: each process has the rate of its own terms, and its record."""
     parts = side_by_side(zones, field)
     balances = {name: ep.thruster.zone_balance(field, zone) for name, zone in parts.items()}
@@ -265,7 +265,7 @@ def model_record(found, balances, sizes) -> dict[str, xr.Dataset]:
 
 
 def toy(output: Path) -> list[str]:
-    """Overrides that run `+exp=zones` on a file of the chain, which is written beside its runs."""
+    """Overrides that run `+exp=zones` on a file of the chain, which is written next to its runs."""
     record = chain()
     z = np.array([0.0025, 0.0075, 0.0125, 0.0175, 0.0225, 0.0275])
     density = {

@@ -95,7 +95,7 @@ def test_what_starts_at_zero_has_a_scale_of_its_own() -> None:
 
 @pytest.mark.parametrize("start", [0.0, 1.0])
 def test_a_chain_from_zero_runs_in_any_unit(start: float) -> None:
-    """n' = 1e18, m' = n - m: m starts at zero (or at nothing beside 1e18), and so does its rate."""
+    """n' = 1e18, m' = n - m: m starts at zero, or at nothing next to 1e18, as its rate does."""
     t = np.linspace(0.0, 6.0, 25)
     states = chain().simulate(t, [start, start]).states
     exact = np.stack([t, t - 1.0 + np.exp(-t)], axis=1)

@@ -31,7 +31,7 @@ def errors(size: float | np.ndarray, *, seed: int = 0, n: int = 40) -> np.ndarra
     return size * (1.0 + 0.1 * rng.standard_normal((n, N_HORIZONS)))
 
 
-def test_a_gain_at_all_horizons_is_told() -> None:
+def test_a_gain_at_all_horizons_is_stated() -> None:
     found = skill(model=errors(0.1), autoregression=errors(0.3, seed=1))
     assert found.text == "better than an autoregression (AR 3) for 2 periods and more"
     assert found.headline == f"a model that forecasts {found.text}"

@@ -114,7 +114,7 @@ def test_functions_of_ones_own_stay_with_scipy() -> None:
 
 @pytest.mark.parametrize("compiled", [True, False])
 def test_a_run_ends_after_its_time(compiled: bool) -> None:
-    """A clock that goes on by a second each time that it is read."""
+    """A clock that continues by a second each time that it is read."""
     fast = products(ep.systems.damped_oscillator(zeta=0.0, omega=1e6).model)
     ticks = count()
     found = run(

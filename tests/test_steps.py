@@ -43,7 +43,7 @@ def by_quantity(file: h5py.File, k: int) -> None:
 
 
 def openpmd(file: h5py.File, k: int) -> None:
-    """Meshes with units and grids in attributes, beside particles whose number changes."""
+    """Meshes with units and grids in attributes, next to particles whose number changes."""
     group = file.create_group(f"data/{NUMBERS[k]}")
     group.attrs.update({"time": 1e6 * T[k], "dt": 0.02, "timeUnitSI": 1e-6})
     mesh = group.create_dataset("fields/n_i", data=1e-18 * N_I[k])
@@ -90,7 +90,7 @@ def check(field: xr.Dataset) -> None:
     np.testing.assert_allclose(field["z"].values, Z, rtol=1e-12, atol=1e-18)
 
 
-def test_particles_whose_number_changes_are_left_out_and_said(tmp_path: Path) -> None:
+def test_particles_whose_number_changes_are_left_out_and_reported(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "a.h5", "w") as file:
         for k in range(N):
             openpmd(file, k)
@@ -173,7 +173,7 @@ def test_groups_of_kinds_are_no_steps(tmp_path: Path, names: tuple[str, ...]) ->
     assert len(found.held) == len(names)
 
 
-def test_numbered_groups_beside_times_are_no_steps(tmp_path: Path) -> None:
+def test_numbered_groups_next_to_times_are_no_steps(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["time"] = T
         for k in range(4):

@@ -68,7 +68,7 @@ LAYOUTS = {
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_layouts_are_told_from_their_content(tmp_path: Path, layout: str, encoding: str) -> None:
+def test_layouts_are_stated_from_their_content(tmp_path: Path, layout: str, encoding: str) -> None:
     text, names, units, factor = LAYOUTS[layout]
     (tmp_path / "a.txt").write_text(text, encoding=encoding)
     source = open_source(tmp_path / "a.txt")
@@ -89,7 +89,7 @@ def test_text_goes_by_many_endings_and_columns_by_their_number(tmp_path: Path, e
     np.testing.assert_allclose(field["I_d"].values, 1e-3 * X, rtol=1e-8)
 
 
-def test_rigol_counts_its_samples_and_says_the_step_beside_the_names(tmp_path: Path) -> None:
+def test_rigol_counts_its_samples_and_says_the_step_next_to_the_names(tmp_path: Path) -> None:
     text = "X,CH1,Start,Increment,\nSequence,Volt,-6.0e-03,1.5e-06\n"
     (tmp_path / "a.csv").write_text(text + rows(np.arange(30), X, end=","))
     field = ep.open_field(tmp_path / "a.csv")
@@ -178,20 +178,20 @@ def test_units_of_a_preamble_are_those_of_the_columns(tmp_path: Path) -> None:
     assert ep.inspect_file(tmp_path / "a.csv").time == ep.data.Variable("TIME", "s")
 
 
-def test_a_gap_that_a_preamble_knows_nothing_of_stays_and_is_said(tmp_path: Path) -> None:
+def test_a_gap_that_a_preamble_knows_nothing_of_stays_and_is_reported(tmp_path: Path) -> None:
     times = np.where(np.arange(len(T)) < 15, T, T + 4e-4)
     path = tektronix(tmp_path / "a.csv", times)
     np.testing.assert_allclose(ep.open_field(path)["time"].values, times, atol=1e-18)
     notes = " ".join(ep.inspect_file(path).notes())
     assert "'TIME' have a gap: 0.0004015 pass after row 15, where steps are 1.5e-06" in notes
-    assert "the file says steps of 1.5e-06 s beside them; the times are taken" in notes
+    assert "the file says steps of 1.5e-06 s next to them; the times are taken" in notes
 
 
-def test_a_preamble_that_contradicts_the_times_is_said(tmp_path: Path) -> None:
+def test_a_preamble_that_contradicts_the_times_is_reported(tmp_path: Path) -> None:
     path = tektronix(tmp_path / "a.csv", 2.0 * T)
     np.testing.assert_allclose(ep.open_field(path)["time"].values, 2.0 * T, atol=1e-18)
     notes = " ".join(ep.inspect_file(path).notes())
-    assert "'TIME' go in steps of 3e-06 s, and the file says steps of 1.5e-06 s beside" in notes
+    assert "'TIME' go in steps of 3e-06 s, and the file says steps of 1.5e-06 s next to" in notes
 
 
 def test_rounded_times_take_the_step_of_the_preamble(tmp_path: Path) -> None:
@@ -259,7 +259,7 @@ def test_a_first_column_of_another_name_is_no_time_unless_the_user_says_so(tmp_p
     assert note.endswith("or, if 'when' is time, 'data.time={name:when,unit:UNIT}'")
 
 
-def test_a_preamble_beside_the_rows_says_units(tmp_path: Path) -> None:
+def test_a_preamble_next_to_the_rows_says_units(tmp_path: Path) -> None:
     """As oscilloscopes of the series TDS write it."""
     labels = ["Sample Interval,1.5e-06", "Vertical Units,mV", "Horizontal Units,s", "Pt Fmt,Y"]
     lines = [f"{label},,{t:.9e},{x:.9e}," for label, t, x in zip(labels, T, X, strict=False)]
@@ -296,7 +296,7 @@ def test_a_line_of_separators_and_marks_of_clipping_are_missing_samples(tmp_path
         ["2024-01-31 11:59:58 AM,", "2024-01-31 11:59:59.5 AM,", "2024-01-31 12:00:01 PM,"],
     ],
 )
-def test_the_time_of_day_may_stand_beside_the_date(tmp_path: Path, stamps: list[str]) -> None:
+def test_the_time_of_day_may_stand_next_to_the_date(tmp_path: Path, stamps: list[str]) -> None:
     lines = [f"{stamp},{k % 2}" for k, stamp in enumerate(stamps)]
     (tmp_path / "a.csv").write_text("date,clock,x\n" + "\n".join(lines) + "\n")
     np.testing.assert_allclose(ep.open_field(tmp_path / "a.csv")["time"].values, [0.0, 1.5, 3.0])

@@ -81,7 +81,7 @@ propellant:
 def test_a_thruster_of_ones_own_is_found_where_one_stands(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """With the field and the rates from files beside it, and no line of Python."""
+    """With the field and the rates from files next to it, and no line of Python."""
     (tmp_path / "conf" / "thruster").mkdir(parents=True)
     (tmp_path / "conf" / "thruster" / "mine.yaml").write_text(OWN)
     (tmp_path / "B.csv").write_text("z_mm,B_mT\n0,1\n10,9\n20,18\n30,12\n50,2\n")

@@ -121,7 +121,7 @@ def test_columns_of_one_name_are_numbered_and_none_is_taken_for_the_name(tmp_pat
         ep.open_field(tmp_path / "a.csv", variables={"x": ep.data.Variable("x", "1")}, dt_s=1.0)
 
 
-def test_columns_that_are_left_out_are_said(tmp_path: Path) -> None:
+def test_columns_that_are_left_out_are_reported(tmp_path: Path) -> None:
     text = "t,x,note,rare\n" + "".join(f"{k},{k},ok,{k if k == 3 else ''}\n" for k in range(9))
     (tmp_path / "a.csv").write_text(text)
     assert "left out: note" in open_source(tmp_path / "a.csv").words

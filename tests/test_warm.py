@@ -28,7 +28,7 @@ def compilations(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[bool]:
     return outcomes
 
 
-def test_kernels_are_compiled_once_and_said_to_be(
+def test_kernels_are_compiled_once_and_reported_to_be(
     compilations: list[bool], capsys: pytest.CaptureFixture[str]
 ) -> None:
     precompile.precompile()
@@ -110,7 +110,7 @@ def test_a_kernel_is_kept_where_one_may_write_and_follows_what_it_calls(
 
 
 @pytest.mark.usefixtures("compilations")
-def test_an_administrator_puts_kernels_beside_the_package(
+def test_an_administrator_puts_kernels_next_to_the_package(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     made, lacking = tmp_path / "cache" / "kernels" / "model_1", tmp_path / "none"
@@ -125,7 +125,7 @@ def test_an_administrator_puts_kernels_beside_the_package(
         assert (kernel / "a.nbi").read_text() == "index"
 
 
-def test_without_a_folder_kernels_are_compiled_every_time_and_it_is_said(kernels: Path) -> None:
+def test_without_a_folder_kernels_are_compiled_every_time_and_it_is_reported(kernels: Path) -> None:
     run = called(kernels, EP2SINDY_CACHE="/dev/null")
     assert run.stdout == "5.0\n"
     assert run.stderr.count("they are not kept, for") == 1

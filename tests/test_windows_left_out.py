@@ -95,7 +95,7 @@ def test_the_truth_is_selected_from_exact_samples(system: System) -> None:
 
 @pytest.mark.parametrize("noise", [pytest.param(0.0, marks=pytest.mark.slow), 0.05])
 def test_biased_coefficients_of_the_truth_are_mended(noise: float) -> None:
-    # A needless term beside good coefficients competes with the truth and poor ones.
+    # A needless term next to good coefficients competes with the truth and poor ones.
     run = PREY.trajectory(noise=noise, rng=np.random.default_rng(0))
     poor = {
         s: {name: c * (1.0 + 0.2 * (-1) ** k) for k, (name, c) in enumerate(terms.items())}
@@ -150,7 +150,7 @@ def test_a_combination_that_diverges_gets_the_largest_error() -> None:
     assert scores[0][1] < 1.0
 
 
-def test_what_refines_does_not_judge(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_refines_does_not_assess(monkeypatch: pytest.MonkeyPatch) -> None:
     batches: list[WindowBatch] = []
     pieces: list[list[ep.Trajectory]] = []
 
@@ -179,7 +179,7 @@ def test_what_refines_does_not_judge(monkeypatch: pytest.MonkeyPatch) -> None:
         assert len(set(held)) == len(held)
 
 
-def test_two_windows_refine_and_judge_by_turns() -> None:
+def test_two_windows_refine_and_assess_by_turns() -> None:
     run = PREY.trajectory(noise=0.05, rng=np.random.default_rng(1)).window(0, 400)
     fronts = fronts_of([run], PREY.model.library, next_to_truth(PREY, WRONG["Lotka-Volterra"]))
     assert picked(replace(RULE, n_windows=2), fronts) == supports(PREY)
@@ -269,7 +269,7 @@ def test_a_refinement_that_ends_worse_than_it_began_is_not_kept() -> None:
     )
 
 
-def test_what_cannot_be_judged_is_refused() -> None:
+def test_what_cannot_be_assessed_is_refused() -> None:
     run = PREY.trajectory()
     choices = {s: [PREY.model.terms(s)] for s in PREY.model.states}
     fronts = fronts_of([run], PREY.model.library, choices)

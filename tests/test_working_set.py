@@ -99,7 +99,7 @@ def test_exchanges_start_from_known_supports() -> None:
 
 
 def test_dependent_terms_are_not_exchanged() -> None:
-    """A column that repeats another one adds nothing beside it, and one of zeros adds nothing."""
+    """A column that repeats another one adds nothing next to it, and one of zeros adds nothing."""
     rng = np.random.default_rng(0)
     columns = rng.standard_normal((50, 4))
     columns[:, 2], columns[:, 3] = columns[:, 0], 0.0
@@ -182,7 +182,7 @@ def test_small_libraries_are_weighed_whole() -> None:
 
 
 def exact_gains(pair: Gram, support: np.ndarray) -> np.ndarray:
-    """Fall of the quadratic function of all coefficients by each one beside a support."""
+    """Fall of the quadratic function of all coefficients by each one next to a support."""
     inverse = invert_gram(pair.quadratic[np.ix_(support, support)])
     fraction = pair.quadratic[:, support] @ inverse
     own = np.diag(pair.quadratic) - np.einsum("js,js->j", fraction, pair.quadratic[:, support])

@@ -142,7 +142,7 @@ def read_run(folder: Path, number: int) -> ReadRun:
 
 
 def _nearby(folder: Path) -> str:
-    """Runs found below the folder, beside it, or in the output folder, for an error message."""
+    """Runs found below the folder, next to it, or in the output folder, for an error message."""
     for place in (folder, folder.parent, Path("outputs")):
         found = sorted(path.parent for path in place.glob("**/summary.json"))[-3:]
         if found:
@@ -153,7 +153,7 @@ def _nearby(folder: Path) -> str:
 def compare_runs(runs: Sequence[ReadRun], figures: Sequence[str], *, beside: Path) -> list[Section]:
     """Sections on runs, differing settings, headline figures, equations and figures.
 
-    figures: names of those that all runs have. beside: folder of the page.
+    figures: names of those that all runs have. next to: folder of the page.
     """
     rows = [
         {

@@ -79,7 +79,7 @@ def command(arguments: Sequence[str], conf: Path) -> bool:
 
 
 def conf_folder() -> Path:
-    """Folder of the package's configs: beside it in a checkout, inside it when installed."""
+    """Folder of the package's configs: next to it in a checkout, inside it when installed."""
     places = (PACKAGE.parent / "conf", PACKAGE / "conf")
     for place in places:
         if (place / "config.yaml").is_file():
@@ -129,7 +129,7 @@ def run(conf: Path) -> list[str]:
 
 
 def run_job(config: DictConfig, conf: Path) -> list[str]:
-    """Run one job; returns why it ended early, if it did. A sweep notes that and goes on.
+    """Run one job; returns why it ended early, if it did. A sweep notes that and continues.
 
     In a sweep, its record for `compare` is written when it ends, in whichever way.
     """

@@ -40,7 +40,7 @@ def main(arguments: Sequence[str]) -> None:
     """Compile, and report where the kernels are kept."""
     parser = argparse.ArgumentParser("ep2sindy precompile", description=ABOUT)
     parser.add_argument(
-        "--shared", action="store_true", help="keep them beside the package, for all users"
+        "--shared", action="store_true", help="keep them next to the package, for all users"
     )
     given = parser.parse_args(arguments)
     try:

@@ -171,7 +171,7 @@ class Task:
     runs: trajectories of the same states, which agree in the units of the library's variables.
     hidden: states that nobody measured.
     Raises ValueError for runs that do not agree or that share samples, a state that repeats
-    another, a variable that a run lacks, facts of unknown states, roles beside hidden states, or
+    another, a variable that a run lacks, facts of unknown states, roles next to hidden states, or
     states that are negative where roles say that they are not.
     """
 

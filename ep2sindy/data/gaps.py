@@ -71,7 +71,7 @@ def usual_step(t: Float[np.ndarray, " samples"]) -> float:
 def between_gaps(t: Float[np.ndarray, " samples"]) -> list[tuple[int, int]]:
     """First and last sample (exclusive) of every segment of times without a gap.
 
-    A gap is a step that is long beside the median step, and beside a step next to it: times that
+    A gap is a step that is long next to the median step, and next to a step next to it: times that
     grow by a factor from one to the next have long steps, and no gap.
     """
     steps = np.diff(t)
@@ -99,7 +99,7 @@ def describe_gaps(t: Float[np.ndarray, " kept"], n_samples: int) -> str:
     return (
         f"{n_samples - len(t)} of {n_samples} samples are missing (NaN) and left out; the longest "
         f"gap is {longest:.4g} s, {longest / usual:.0f} steps: crop the record if that is long "
-        "beside its period, or fill it with ep2sindy.data.interpolate"
+        "next to its period, or fill it with ep2sindy.data.interpolate"
     )
 
 

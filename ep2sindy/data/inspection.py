@@ -122,7 +122,7 @@ class Inspection:
         texts = [*self.asked]
         if self.dt_s is not None:
             how = "is the number of a step times" if self.source.steps else "in steps of"
-            texts.append(f"time {how} {self.dt_s:.6g} s, as the file says beside its arrays")
+            texts.append(f"time {how} {self.dt_s:.6g} s, as the file says next to its arrays")
         texts += self.questions
         texts += [
             f"{n} is made by {step} from {MADE_FROM[n][0]}" for n, step in self.prepare.items()

@@ -353,7 +353,7 @@ def time_length(
     if not votes:
         shapes = {ours: array.shape for ours, array in arrays.items()}
         raise ValueError(
-            f"the samples must be countable: no axis of {shapes} is left for time beside z and r "
+            f"the samples must be countable: no axis of {shapes} is left for time next to z and r "
             f"of {space} points; name the coordinates, or give data.variables.NAME.dims"
         )
     (best, n_best), *others = votes.most_common()

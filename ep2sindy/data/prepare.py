@@ -82,7 +82,7 @@ def gradient(field: xr.Dataset, *, of: str, name: str, axis: str = "z") -> xr.Da
     that moved the simulator's density. The last cell, whose far face is not recorded, is then NaN.
     Otherwise differences over the neighbouring cells are taken, of second order on uneven grids,
     from the record's time average of the product (attribute `average_of`) if it has one; they are
-    one-sided at the ends, and NaN beside a masked cell. Computed in float64.
+    one-sided at the ends, and NaN next to a masked cell. Computed in float64.
     It is the slope alone: the divergence of a radial flux q in a cylinder is (1/r) d(r q)/dr, and
     that of an axial one through a cross-section A that widens is (1/A) d(A q)/dz.
     Raises ValueError for an axis that the field or the variables lack, a single cell, an unknown

@@ -50,7 +50,7 @@ FULL = {
     "V_d": _names("discharge voltage"),
 }
 
-# Names that other things bear too, which count only beside a unit that fits.
+# Names that other things bear too, which count only next to a unit that fits.
 SHORT = {
     "n_i": _names("n i, ni, n ion, nion, n plasma, i density"),
     "n_n": _names("n n, nn, n neutral, nneutral, na, n a, ng, n g"),

@@ -1,6 +1,6 @@
 """Recognition of a file's arrays by their names, units and shapes, without a mapping.
 
-A name means a quantity only beside a unit that fits it, if it says so in full, or if the user says
+A name means a quantity only next to a unit that fits it, if it says so in full, or if the user says
 that all is of a plasma. What the file leaves open is asked.
 """
 
@@ -221,7 +221,7 @@ class _Arrays:
             ]
             time = replace(time, unit=fit[0] if fit else "")
         times, stated_s = f"the times of {one.name!r}", self.source.step_s
-        stated = f", and the file says steps of {stated_s:.6g} s beside them" if stated_s else ""
+        stated = f", and the file says steps of {stated_s:.6g} s next to them" if stated_s else ""
         usual_s = (one.step or 0.0) * conversion("time", time.unit or "s")[0]
         if one.digits is not None:
             self.questions.append(

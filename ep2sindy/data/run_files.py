@@ -95,7 +95,7 @@ class FilePattern:
             shown = f": {', '.join(near[:MOST_SHOWN])} ..." if near else ""
             raise ValueError(
                 f"no file fits the pattern {self.text!r} in {Path.cwd()}, a number in the place "
-                f"of each {{NAME}}; there are {len(near)} files beside it{shown}"
+                f"of each {{NAME}}; there are {len(near)} files next to it{shown}"
             )
         ordered = sorted(found.items(), key=lambda pair: tuple(pair[1].values()))
         return dict(ordered), others

@@ -186,7 +186,7 @@ def _joined(
     shared: Mapping[str, Place],
     kind: str,
 ) -> FileSource:
-    """Source of arrays joined over steps. first: gives all else. shared: arrays beside the steps.
+    """Source of arrays joined over steps. first: gives all else. shared: arrays next to the steps.
 
     Each array is read once, for it may take thousands of files.
     Arrays that some steps lack, and lists of particles, whose lengths change, are left out.

@@ -423,7 +423,7 @@ def spread_blocks(runs: Sequence[Trajectory], *, most: int, block: int) -> list[
     return found or list(runs)
 
 
-# Samples as a pandas table or an xarray Dataset, to go on with in other tools.
+# Samples as a pandas table or an xarray Dataset, to continue with in other tools.
 
 
 CLOCK = "read_in"  # attribute of the time coordinate: the unit in which times are displayed

@@ -95,7 +95,7 @@ def discover(
         found = _discover_point((task, rng), method=method, progress=watch)
     else:
         found = _discover_apart(task, method, workers or Serial(), rng, watch)
-    return replace(found, remarks=(*found.remarks, *averaged))
+    return replace(found, data_warnings=(*found.data_warnings, *averaged))
 
 
 def _hidden_names(hidden: Sequence[str] | int, taken: Sequence[str]) -> Sequence[str]:

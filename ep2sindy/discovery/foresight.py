@@ -15,8 +15,8 @@ N_STARTS = 100
 # Of fewer turns, a moment may have no neighbours, and nothing is reported.
 ENOUGH_TURNS = 20.0
 
-# What a signal with a law of few states shows: neighbours that go on alike for a quarter of a turn,
-# or that are nearer than a linear autoregression for so long.
+# What a signal with a law of few states shows: neighbours that continue alike for a quarter of a
+# turn, or that are nearer than a linear autoregression for so long.
 TURN, NEARER = 0.25, 0.9
 
 
@@ -25,7 +25,7 @@ def is_linear(signal: Signal) -> bool:
 
     The second half of the signal is forecast from its own past, by neighbours in the first. They
     end within a quarter of a turn, and are no nearer there than the autoregression. No exact
-    trajectory of a few states goes on like that, unless noise drowns it. False for signals that
+    trajectory of a few states continues like that, unless noise drowns it. False for signals that
     repeat themselves, are driven by inputs, or have under twenty turns: they are not looked at.
     """
     if signal.repeats or signal.run.input_names or signal.n_periods < ENOUGH_TURNS:

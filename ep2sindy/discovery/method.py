@@ -109,7 +109,7 @@ class TrajectorySearch:
         return replace(
             self._choose(found, task, progress),
             ambiguities=_ambiguities_of_samples(task),
-            remarks=found.remarks,
+            data_warnings=found.data_warnings,
             estimate=found,
         )
 
@@ -261,8 +261,8 @@ class Regression:
             if not set(rows.equations) <= set(task.facts.only):
                 found += few_rows(rows)
             found += ambiguities(rows)
-        remarks = _limits(task.runs)
-        return replace(choice, ambiguities=tuple(dict.fromkeys(found)), remarks=remarks)
+        data_warnings = _limits(task.runs)
+        return replace(choice, ambiguities=tuple(dict.fromkeys(found)), data_warnings=data_warnings)
 
     def _choose_under(
         self, roles: Roles, task: Task, *, rng: np.random.Generator, progress: Progress
@@ -362,7 +362,7 @@ def method_of(
     """The method for settings that are chosen one by one, such as the groups of a config.
 
     A `TrajectorySearch` takes the rule and the depth, unless its own are set, and ignores the
-    formulation: it makes no rows, but experiments may make some beside it.
+    formulation: it makes no rows, but experiments may make some next to it.
     Raises ValueError for bootstraps that do not go with the search, or a rule or depth that differs
     from the search's own.
     """
@@ -380,7 +380,7 @@ def method_of(
             if own not in (default, given):
                 raise ValueError(
                     f"{name} must be set once, got {own!r} in the search (search.{name}), and "
-                    f"{given!r} beside it; leave one of them out"
+                    f"{given!r} next to it; leave one of them out"
                 )
             set_here[name] = given
     return replace(search, **set_here)

@@ -59,7 +59,7 @@ MIN_ASSESSED = 1.5  # periods that a held-out part must have
 
 @dataclass(frozen=True)
 class StatedFacts:
-    """What is known of the equations of a signal and its states, beside what these are.
+    """What is known of the equations of a signal and its states, next to what these are.
 
     exclude: state -> terms that its equation does not have. relations: between coefficients, as
     for `Library.relate`. rests_at_zero: whether a signal that is zero and does not change stays so:
@@ -238,7 +238,7 @@ class Attempt:
 
     @property
     def process_noise_std(self) -> dict[str, float]:
-        """What moves every state at random over a mean step beside the model, by state, in SI."""
+        """What moves every state at random over a mean step next to the model, by state, in SI."""
         process = self.estimator.noise.process.tolist()
         return dict(zip(self.found.model.states, process, strict=True))
 
@@ -266,7 +266,7 @@ def try_in_turn(
     linear signal, linear equations of the first smoothed states alone are tried. method: of the
     search in smoothed states; a rule that runs models tests them by the signal. stated: of the
     equations. linear: whether the signal is (`is_linear`); None finds out. once: does each search,
-    or takes it from a run that was broken off.
+    or takes it from a run that was interrupted.
     """
     stated, linear = stated or StatedFacts(), is_linear(past) if linear is None else linear
     smoothed = [each for each in tried if each.how != "hidden"]
@@ -377,7 +377,7 @@ def run_on_rest(
 
 
 def complete_states(signal: Signal, known: Trajectory) -> Trajectory:
-    """Samples of the signal as measured, with the other states beside it as far as they are known.
+    """Samples of the signal as measured, with the other states next to it as far as they are known.
 
     Where a state is not known, at the beginning or beyond the fitted part, the nearest is taken;
     forecasts there make their own.

@@ -82,7 +82,7 @@ class DiscoveryMethod(Protocol):
     ) -> Discovery: ...
 
 
-# What a file may hold beside the values that configs may name.
+# What a file may hold next to the values that configs may name.
 STORED = {
     kind.__name__: kind
     for kind in (
@@ -109,14 +109,14 @@ class Discovery:
     method: that found the model. noise_test: test of the residuals against the noise.
     ambiguities: terms that these data cannot distinguish, and warnings of too few rows for the
     terms. note: how a rule for whole systems decided, how certain a trajectory search is, or that
-    the residuals exceed the noise; else empty. remarks: sentences on where the samples deviate from
-    the assumptions (`Estimate.remarks`). estimate: of states and coefficients together, after a
-    trajectory search. constraint: that the model's coefficients obey under relations or roles, to
-    be handed to `refine`; None without. others: of a rule that runs whole systems, those of as many
-    free coefficients that sustain their oscillation as well. points: of runs at several operating
-    points, the discovery at each, by its label, such as "V_D_V=300, mdot_mg_s=5"; model and all
-    else are then those of the most central point. law: of all coefficients over the operating
-    points, if it was asked for.
+    the residuals exceed the noise; else empty. data_warnings: sentences on where the samples
+    deviate from the assumptions (`Estimate.data-quality warnings`). estimate: of states and
+    coefficients together, after a trajectory search. constraint: that the model's coefficients obey
+    under relations or roles, to be handed to `refine`; None without. others: of a rule that runs
+    whole systems, those of as many free coefficients that sustain their oscillation as well.
+    points: of runs at several operating points, the discovery at each, by its label, such as
+    "V_D_V=300, mdot_mg_s=5"; model and all else are then those of the most central point. law: of
+    all coefficients over the operating points, if it was asked for.
 
     >>> run = ep.lotka_volterra().trajectory(noise=0.05, rng=0)
     >>> found = ep.discover(run)
@@ -133,7 +133,7 @@ class Discovery:
     ambiguities: Sequence[Ambiguity] = ()
     noise_test: NoiseTest = field(default_factory=NoiseTest)
     note: str = ""
-    remarks: Sequence[str] = ()
+    data_warnings: Sequence[str] = ()
     estimate: Estimate | None = field(default=None, repr=False)
     constraint: Constraint | None = field(default=None, repr=False)
     others: Sequence[OtherSystem] = field(default=(), repr=False)
@@ -266,7 +266,7 @@ class Discovery:
         )
 
     def _notes(self) -> list[str]:
-        return [*self.remarks, *(each.message for each in self.ambiguities)]
+        return [*self.data_warnings, *(each.message for each in self.ambiguities)]
 
     def _headline(self) -> str:
         where = ""
@@ -297,7 +297,7 @@ def join_points(
     return replace(central, points=points, law=law)
 
 
-# Fields of a Discovery that are stored beside the model, and the kind of each or of its values.
+# Fields of a Discovery that are stored next to the model, and the kind of each or of its values.
 _PARTS: Mapping[str, Any] = {
     "fronts": ParetoFront,
     "chosen": Candidate,
@@ -305,7 +305,7 @@ _PARTS: Mapping[str, Any] = {
     "ambiguities": Ambiguity,
     "noise_test": NoiseTest,
     "note": str,
-    "remarks": str,
+    "data_warnings": str,
     "constraint": Constraint | None,
     "others": OtherSystem,
 }

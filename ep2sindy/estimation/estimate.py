@@ -1,6 +1,6 @@
 """Joint estimation of states and sparse coefficients, and the report of its result.
 
-Besides the model, the result holds remarks: sentences about the samples and their noise.
+Besides the model, the result holds data_warnings: sentences about the samples and their noise.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from ep2sindy.estimation.cost import SearchMonitor, check_limit_s, check_size, g
 from ep2sindy.estimation.explanation import Explanation, explain, explain_under_noise
 from ep2sindy.estimation.hidden import Coupling, with_guesses
 from ep2sindy.estimation.likelihood import Gram, gram, hessian_on
-from ep2sindy.estimation.noise import remark
+from ep2sindy.estimation.noise import data_warning
 from ep2sindy.estimation.observation import Solution
 from ep2sindy.estimation.problem import (
     FIRST_MAX_TERMS,
@@ -90,11 +90,11 @@ class Estimate:
     fraction of the noise; 0 if the residuals are nothing but noise. process_noise_std: (d,), of
     what moves every state at random over a mean step, in SI; 0 if an exact trajectory explains the
     samples. lack_of_fit: the reason why these equations do not explain the data; empty if they do.
-    too_few_samples: a remark if they are too few to decide; otherwise empty. explained_states: of a
-    lack of fit, the states whose equations explain their samples all the same. supports: for each
+    too_few_samples: a warning if they are too few to decide; otherwise empty. explained_states: of
+    a lack of fit, the states whose equations explain their samples all the same. supports: for each
     state, the best supports of every size. rivals: other plausible supports, the most likely first.
-    remarks: sentences on where the samples deviate from the assumptions: limits of sensors, noise
-    that is correlated in time, grows with the state or has outliers, and collinear states.
+    data_warnings: sentences on where the samples deviate from the assumptions: limits of sensors,
+    noise that is correlated in time, grows with the state or has outliers, and collinear states.
     kurtosis: (d,), of the noise; 3 if it is normal, NaN if every sample is a limit. growth: (d,),
     fraction of the noise variance that grows with the state. delays_s: (d,), the delay of each
     channel. `align=True` shifts the channels back into step, and leaves out the samples at the ends
@@ -111,7 +111,7 @@ class Estimate:
     too_few_samples: str
     supports: Mapping[str, Sequence[ScoredSupport]] = field(repr=False)
     rivals: Sequence[Rival]
-    remarks: tuple[str, ...]
+    data_warnings: tuple[str, ...]
     kurtosis: ByState
     growth: ByState
     delays_s: ByState
@@ -121,7 +121,7 @@ class Estimate:
 
     @property
     def note(self) -> str:
-        """The most important remark on the fit, on one line."""
+        """The most important warning on the fit, on one line."""
         if self.lack_of_fit:
             return self.lack_of_fit
         if not self.rivals:
@@ -194,7 +194,7 @@ def estimate(
             f"the equations come from {some} of {n} samples, {len(part)} blocks spread over the "
             f"record: limit_s={limit_s:g} leaves no time for more, or memory does not hold them"
         )
-        answer = replace(answer, remarks=(words, *answer.remarks))
+        answer = replace(answer, data_warnings=(words, *answer.data_warnings))
     library, constraint = task.library.with_known_terms(task.states), None
     if facts.roles is not None:
         played = compress(answer.solution.problem.processes, answer.solution.fit.free != 0.0)
@@ -289,7 +289,7 @@ class _Way:
         return self._stated(found)
 
     def _stated(self, found: Explanation) -> Explanation:
-        return replace(found, remarks=(*self.words, *found.remarks))
+        return replace(found, data_warnings=(*self.words, *found.data_warnings))
 
 
 def _report(
@@ -321,7 +321,7 @@ def _report(
         too_few_samples=_report_too_few(problem) or _open_choice(problem, supports),
         supports=supports,
         rivals=_rivals(problem, found, supports),
-        remarks=(*answer.remarks, *remark(problem, found.noise)),
+        data_warnings=(*answer.data_warnings, *data_warning(problem, found.noise)),
         kurtosis=found.noise.kurtosis,
         growth=found.noise.growth,
         delays_s=answer.delays * problem.step_s,
@@ -420,7 +420,7 @@ def _report_too_few(problem: EstimationProblem) -> str:
 def _open_choice(
     problem: EstimationProblem, supports: Mapping[str, Sequence[ScoredSupport]]
 ) -> str:
-    """A remark if the chosen supports are less likely than all others that were weighed together.
+    """A warning if the chosen supports are less likely than all others that were weighed together.
 
     Penalties of terms are log prior odds, so scores give posterior probabilities (Schwarz 1978,
     doi:10.1214/aos/1176344136).

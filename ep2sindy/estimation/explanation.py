@@ -78,20 +78,20 @@ class Explanation:
     """The solution that is reported: of the samples as given, or of the aligned ones if asked for.
 
     lack_of_fit: the reason why it does not explain the samples; empty if it does. delays: (d,), in
-    mean steps. remarks: on how the samples were changed or explained.
+    mean steps. data_warnings: on how the samples were changed or explained.
     """
 
     solution: Solution
     lack_of_fit: str
     delays: ByState
-    remarks: tuple[str, ...] = ()
+    data_warnings: tuple[str, ...] = ()
 
 
 def explain(
     problem: EstimationProblem, *, max_terms: int | None, align: bool,
     under_noise: Explanation | None = None,
 ) -> Explanation:  # fmt: skip
-    """The most likely support, and what beside its trajectory explains the samples, if need be.
+    """The most likely support, and what next to its trajectory explains the samples, if need be.
 
     max_terms: of one equation; None begins with 7, and allows more where an equation needs them.
     under_noise: of the same problem, if it was asked for before, see `explain_under_noise`.
@@ -141,7 +141,7 @@ def _unfinished(best: Solution | TrajectoryFit, ended: str) -> Explanation:
     solution = best if isinstance(best, Solution) else unfinished_solution(best)
     if solution.fits:
         words = f"the search was {ended}: other starts and terms were not tried"
-        return _explanation(solution, remarks=(words,))
+        return _explanation(solution, data_warnings=(words,))
     words = (
         f"the search was {ended}, and nothing fits as far as the noise yet: the equations are the "
         "best so far; raise limit_s, or take fewer terms"
@@ -150,11 +150,11 @@ def _unfinished(best: Solution | TrajectoryFit, ended: str) -> Explanation:
 
 
 def _explanation(
-    solution: Solution, lack_of_fit: str = "", remarks: tuple[str, ...] = ()
+    solution: Solution, lack_of_fit: str = "", data_warnings: tuple[str, ...] = ()
 ) -> Explanation:
     """A solution, which explains the samples unless there does not fit or a limit to its terms."""
     lack_of_fit = lack_of_fit or _at_limit(solution)
-    return Explanation(solution, lack_of_fit, solution.observation.delays, remarks)
+    return Explanation(solution, lack_of_fit, solution.observation.delays, data_warnings)
 
 
 def _explain(
@@ -182,10 +182,10 @@ def _explain(
             words = delay_lack_of_fit(problem, observed)
             return replace(_explanation(exact, words), delays=observed.delays)
         words = f"{delay_words(problem, observed)}: brought together with the others"
-        return _explanation(best, remarks=(words,))
+        return _explanation(best, data_warnings=(words,))
     if not best.fits:
         return _explanation(best, _lack_of_fit(best))
-    return _explanation(best, remarks=(process_noise_words(best),))
+    return _explanation(best, data_warnings=(process_noise_words(best),))
 
 
 def _on_other_courses(problem: EstimationProblem, delayed: Solution) -> Solution | None:
@@ -229,7 +229,7 @@ def _compare(first: Solution, under_noise: Solution | None) -> tuple[Solution, S
         best = _best(exact, _align(exact))
         if best is not exact:
             return exact, best
-    # Terms outside the set were tested beside the first solution, if it fits.
+    # Terms outside the set were tested next to the first solution, if it fits.
     if not (exact is first if exact.fits else under_noise is not None and under_noise.fits):
         wider = admit_terms(exact if exact.fits else first)
         exact = wider if wider.fits else exact

@@ -148,7 +148,7 @@ class Gram:
     """The squares as a quadratic function of some unknowns z, the states marginalised.
 
     squares(z) = offset - 2 linear' z + z' quadratic z, exact where the fit is linear.
-    z: all free coefficients, and what a flow was differentiated by beside them.
+    z: all free coefficients, and what a flow was differentiated by next to them.
     """
 
     quadratic: Float[np.ndarray, "z z"]
@@ -264,7 +264,7 @@ def _step(fit: TrajectoryFit) -> tuple[ByCoefficient, BySample] | None:
 
 
 def divergence_rate(fit: TrajectoryFit) -> float:
-    """How fast paths beside a fit part: nats per sample that are new, beyond a first state's.
+    """How fast paths next to a fit part: nats per sample that are new, beyond a first state's.
 
     In a long record it is twice the sum of the positive Lyapunov exponents, per mean step. Where it
     is large, the least error of the flow steers the path to any sample, and the squares are no

@@ -424,7 +424,7 @@ def _squared_differences(values: Pieces) -> ByState:
     return np.nansum(np.square(differences), axis=0) / count
 
 
-def remark(problem: EstimationProblem, noise: Noise) -> tuple[str, ...]:
+def data_warning(problem: EstimationProblem, noise: Noise) -> tuple[str, ...]:
     """Remarks on sensor limits, on noise that is not white and normal, and on collinear states."""
     limits = [words for record in problem.records for words in record.limits.words]
     return (

@@ -5,9 +5,9 @@ The delay of a state that lags is one more parameter of how it is sampled:
     y_k(t) = x_k(t - tau_k) + noise, about x_k(t) - tau_k x_k'(t) + noise
 
 With a delayed channel, wrong equations with more terms fit the data no worse. So the delays are not
-read from the residuals. They are unknowns beside the coefficients, and are believed if the squares
+read from the residuals. They are unknowns next to the coefficients, and are believed if the squares
 plus the penalties of terms and delays fall: fewer terms then suffice, or likelier ones. Assumed is
-that each delay is constant, and short beside the times on which the states change; without inputs
+that each delay is constant, and short next to the times on which the states change; without inputs
 a delay that all states share leaves no trace.
 """
 
@@ -234,8 +234,8 @@ def shift_channels(
 ) -> EstimationProblem:
     """The problem with every channel brought forward by its delay, in mean steps.
 
-    A sample moves along the fitted path beside it and keeps its distance, so its noise stays white.
-    Samples that would lie beyond either end are left out.
+    A sample moves along the fitted path next to it and keeps its distance, so its noise stays
+    white. Samples that would lie beyond either end are left out.
     """
     from scipy.interpolate import CubicSpline  # imported only if channels lag
 

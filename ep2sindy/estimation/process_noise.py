@@ -44,7 +44,7 @@ FRACTIONS = (0.3, 1.0, 1.0, 1.0, 1.0)  # of the terms' penalties, in every round
 LAGS = range(1, 9)  # at which innovations are correlated with themselves
 # Standard errors that random innovations may show: see `_test_innovations`.
 MOST_SHOWN = (5.0, 4.0, 6.0)
-COLLINEAR = 1e-3  # fraction of a product that is left beside an equation's terms, if it is another
+COLLINEAR = 1e-3  # fraction of a product that is left next to an equation's terms, if it is another
 LASTING = "the process noise of {state} is not random"
 RUNAWAY = 1e6  # innovations, in RMS of the states, of a model that follows no samples
 # RMS defect of a step, in process noise: the likeliest is smaller than the true one.
@@ -136,7 +136,7 @@ def _test_innovations(fit: TrajectoryFit) -> list[LackOfFit]:
     """What innovations show that random ones would not, in standard errors.
 
     Their largest autocorrelation over a few lags, the largest fraction that one product of states
-    explains beside the terms of the equation, and the fraction that all of them explain: what an
+    explains next to the terms of the equation, and the fraction that all of them explain: what an
     equation lacks is a function of the states, and lasts as long as these.
     """
     problem, found = fit.problem, np.nan_to_num(filter_states(*linearise(fit))[0])
@@ -158,7 +158,7 @@ def _test_innovations(fit: TrajectoryFit) -> list[LackOfFit]:
 def _largest_fraction(
     fit: TrajectoryFit, before: BySample, powers: Float[np.ndarray, "samples _"], new: BySample
 ) -> ByState:
-    """The most that one of the powers explains of innovations beside an equation's terms."""
+    """The most that one of the powers explains of innovations next to an equation's terms."""
     unit = np.sqrt(len(new)) * new / np.maximum(np.linalg.norm(new, axis=0), 1e-150)
     problem, found = fit.problem, np.zeros(unit.shape[1])
     used = problem.coef(fit.free) != 0.0

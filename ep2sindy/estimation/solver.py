@@ -137,7 +137,7 @@ def _exact_solution(
         (
             none + apart,
             float(np.exp(MAX_DIVERGENCE / 2.0)),
-            "paths beside the fit part by a factor of {value:.2g} per sample, so it could follow "
+            "paths next to the fit part by a factor of {value:.2g} per sample, so it could follow "
             "any samples",
         ),
         (noise.unexplained, 0.0, LASTS),

@@ -1,7 +1,7 @@
 """Tables and figures of the benchmark, the frontier, and models of known systems.
 
 The benchmark is a table and a heat map of how often each variant finds the equations. Known
-systems are drawn beside the identified models, as attractors and trajectories.
+systems are drawn next to the identified models, as attractors and trajectories.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Figures of time series: data, models beside them, each in its own row or panel, and forecasts.
+"""Figures of time series: data, models next to them, each in its own row or panel, and forecasts.
 
 The module also holds phase portraits of models and data in the plane of two states, and the
 preparation of curves: the part of a run to show, its limits and its labels.

@@ -88,7 +88,7 @@ def make_panels(
 
 
 def make_row(n: int, *, width: float, height: float) -> tuple[Figure, Sequence[Axes]]:
-    """A figure of n panels beside each other that share both axes, each of this width in inches."""
+    """A figure of n panels side by side that share both axes, each of this width in inches."""
     size = (min(WIDTH, width * n + 0.4), height)
     figure, (axes,) = make_panels(1, n, size, sharex=True, sharey=True)
     return figure, [*axes]

@@ -169,7 +169,7 @@ class Persistence:
 
 @dataclass(frozen=True, eq=False)
 class Harmonics:
-    """The mean waveform of a record goes on, at the phase that the last period shows."""
+    """The mean waveform of a record continues, at the phase that the last period shows."""
 
     cycle: Cycle
 
@@ -318,7 +318,7 @@ def _largest_order(run: Trajectory, segments: Sequence[np.ndarray]) -> int:
 
 # Nearest neighbours: numbers of samples that describe a moment, and of moments that are averaged.
 DELAYS, NUMBERS = (1, 2, 3, 4, 6, 8, 12), (1, 2, 4, 8, 16, 32)
-PER_PERIOD = 8  # delays in a period, beside delays of a sample
+PER_PERIOD = 8  # delays in a period, next to delays of a sample
 N_TRIED, N_HORIZONS = 150, 12  # moments that are forecast to choose among these, and horizons
 MAX_KNOWN = 10_000  # moments that are searched for neighbours
 LEAST_KNOWN = 20  # fewest

@@ -220,7 +220,7 @@ class Evaluation:
         return tuple(found)
 
     def _stays(self, rest: RestPoint) -> bool:
-        """Whether nothing moves beside a rest point, in one direction at least."""
+        """Whether nothing moves next to a rest point, in one direction at least."""
         length_s = float(self.record.t[-1] - self.record.t[0])
         return not rest.frequency_Hz and abs(rest.growth_per_s) * length_s < NEUTRAL
 

@@ -1,4 +1,4 @@
-"""How far ahead a model forecasts a record that it has not seen, beside forecasts without it."""
+"""How far ahead a model forecasts a record that it has not seen, next to forecasts without it."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ class ForecastSkill:
         return n
 
     def _exceeds(self, gain: Float[np.ndarray, " starts"], horizon: int, level: float) -> bool:
-        """Whether gains of the starts are positive beside their standard error."""
+        """Whether gains of the starts are positive next to their standard error."""
         n_apart = len(gain) * self.apart_s / float(self.horizons_s[horizon])  # do not overlap
         most = min(MOST_FREE, len(gain) - 1)
         n_free = int(np.clip(0.5 * n_apart, min(LEAST_FREE, most), most))
@@ -205,7 +205,7 @@ class ForecastSkill:
         )
 
     def _beside_others(self) -> str:
-        """A remark if the mean cycle or neighbours are nearer than the model at most horizons."""
+        """A warning if the mean cycle or neighbours are nearer than the model at most horizons."""
         nearer = [
             WORDS[name]
             for name in (HARMONICS, NEIGHBOURS)

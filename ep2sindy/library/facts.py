@@ -23,7 +23,7 @@ class Facts:
     coefficients, all terms of that equation. excluded: for each state that is named, terms that its
     equation may not have. known: coefficients that are functions of the operating point, in SI.
     roles: of terms, for equations that conserve what states exchange.
-    Raises ValueError for what are no lists of names, an equation without terms, or roles beside
+    Raises ValueError for what are no lists of names, an equation without terms, or roles next to
     anything else.
     """
 

@@ -128,7 +128,7 @@ class Function:
     ) -> Bool[np.ndarray, " samples"]:
         """Mask of the values x of the variable at which the function cannot be used.
 
-        These values do not lie in the same interval of the domain as `beside`, or give an f or f'
+        These values do not lie in the same interval of the domain as `next to`, or give an f or f'
         that is not finite.
         """
         here, there = (self.scale * values + self.shift for values in (x, beside))

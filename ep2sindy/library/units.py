@@ -156,7 +156,7 @@ CALENDAR = ("day", "h", "min", "s")
 def time_unit_in(name: str) -> str | None:
     """Unit of time that a name says: `Year` gives `year`, `Time (h)` gives `h`; else None.
 
-    A short unit such as `h` counts only beside a word for time; T is none.
+    A short unit such as `h` counts only next to a word for time; T is none.
     """
     if re.match(r"T\b", name):
         return None

@@ -36,7 +36,7 @@ FIRST_PERIOD, TOO_NOISY = 0.3, 0.1
 
 
 class Status(StrEnum):
-    """How a model's run goes beside a record, the best first.
+    """How a model's run goes next to a record, the best first.
 
     sustained: it stays on the record's cycle. wrong frequency: amplitudes and waveform are the
     record's, and the frequency is not, or the run misses the record in the first period already.

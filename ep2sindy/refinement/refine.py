@@ -192,7 +192,7 @@ def _resolve_constraints(
         raise ValueError(
             "constraints must hold one entry per model, and replace `constraint`, got "
             f"{len(constraints)} for {len(models)} models"
-            f"{'' if settings.constraint is None else ', beside a common one; leave out one'}"
+            f"{'' if settings.constraint is None else ', next to a common one; leave out one'}"
         )
     return constraints
 

@@ -371,7 +371,8 @@ class WeightedWeak:
         )
 
 
-# Noise below this fraction of an input's standard deviation is negligible beside that of any state.
+# Noise below this fraction of an input's standard deviation is negligible next to that of any
+# state.
 NEGLIGIBLE = 1e-3
 
 MAX_LEVELS = 8  # levels of a switched input at most; a noisy record has more, however coarse

@@ -135,9 +135,8 @@ class BestSubset:
     support of a size is the likeliest. Which size is left to the selection rule. The work grows
     with the number of subsets of up to max_terms terms: a library of 10 terms takes a tenth of a
     millisecond, 20 terms with all sizes a tenth of a second. If a proof would take more than a few
-    seconds, as with more than about sixty terms, the search goes on from the best supports found by
-    exchanges of terms, and warns with `Unproven`.
-    n_best: number of supports of each size.
+    seconds, as with more than about sixty terms, the search continues from the best supports found
+    by exchanges of terms, and warns with `Unproven`. n_best: number of supports of each size.
     Source: Furnival & Wilson 1974, doi:10.1080/00401706.1974.10489231.
 
     >>> xx, xy = np.array([[1.0, 0.6], [0.6, 1.0]]), np.array([0.9, 0.3])
@@ -225,7 +224,7 @@ def exchange_terms(
     For libraries too large for a proof. Each size starts from the best support of the size below
     and its best further term. Terms are then exchanged one for another, the best exchange first, as
     long as the residual falls. From the largest size the search goes back: where the best support
-    of a size, less a term, is better than those of the size below, exchanges go on from there.
+    of a size, less a term, is better than those of the size below, exchanges continue from there.
     One support serves all problems, each with coefficients of its own; the product of their
     residuals is minimised. known: supports to start from as well.
     """

@@ -84,7 +84,7 @@ def compiled(function: Callable | None = None, **options: Any) -> Any:
 def _folder_of(sources: Path) -> str:
     """Where the kernels of a folder of sources are kept; empty if they cannot be.
 
-    Kernels beside the package serve all users: they are copied, since numba reads only where it
+    Kernels next to the package serve all users: they are copied, since numba reads only where it
     may write.
     """
     files = {*sources.glob("*.py"), *_imported(_kernels_in(sources)), THIS}
@@ -123,8 +123,8 @@ def copied(source: Path, target: Path) -> None:
 
 def folders() -> list[Path]:
     """Where all kernels of the package are kept."""
-    rooms = sorted({path.parent for path in _kernels_in(PACKAGE)})
-    return [Path(folder) for room in rooms if (folder := _folder_of(room))]
+    subpackages = sorted({path.parent for path in _kernels_in(PACKAGE)})
+    return [Path(folder) for name in subpackages if (folder := _folder_of(name))]
 
 
 def digest(files: Iterable[Path]) -> str:

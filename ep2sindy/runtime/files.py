@@ -44,7 +44,7 @@ def writing(path: Path) -> Iterator[None]:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Yield a temporary path beside `path`; the file is renamed to `path` if the block succeeds.
+    """Yield a temporary path next to `path`; the file is renamed to `path` if the block succeeds.
 
     The temporary keeps the suffix, since writers choose the format by it. If the block ends early
     (an error, Ctrl-C), a file at `path` stays as it was. Raises WriteError, an OSError.

@@ -171,7 +171,7 @@ def at_once(function: Callable[[], Any]) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class KeptWorkers:
-    """Workers whose finished pieces are kept in a folder, and read back by a run that goes on.
+    """Workers whose finished pieces are kept in a folder, and read back by a run that continues.
 
     A piece is named by the number of the call of `run` that it belongs to, and by its own: the
     calls must come in the same order in every run of the same settings. folder: None keeps nothing.

@@ -200,8 +200,8 @@ def follow_phase(
     """Unwrapped phase in rad, at every sample, of the component of x near a phase linear in time.
 
     x is demodulated and averaged under a Hann window of eight periods, or of half the record if
-    that is shorter. Where the window reaches beyond an end of the record, the phase goes on as the
-    linear one.
+    that is shorter. Where the window reaches beyond an end of the record, the phase continues as
+    the linear one.
     """
     slow = (x - x.mean()) * np.exp(-1j * straight)
     even = t if is_uniform(t) else np.linspace(t[0], t[-1], len(t))

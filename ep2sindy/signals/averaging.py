@@ -55,7 +55,7 @@ def average_alike(
 def average_long(
     runs: Sequence[Trajectory], decimate: int | str | None
 ) -> tuple[list[Trajectory], tuple[str, ...]]:
-    """`average_alike`; "auto" leaves short records, and keeps what is fast beside the period.
+    """`average_alike`; "auto" leaves short records, and keeps what is fast next to the period.
 
     Records are long if they hold over twenty thousand samples together. Means may take a millionth
     of the power of a state that stands out of the noise, and no more.

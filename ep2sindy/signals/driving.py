@@ -1,7 +1,7 @@
 """Whether something outside drives a signal: signs in its record, and a drive of known period.
 
 A record of a driven signal alone looks like that of a self-sustained oscillation, and equations are
-found for either. Three signs tell them apart: a column beside it that looks set, a frequency that
+found for either. Three signs tell them apart: a column next to it that looks set, a frequency that
 somebody chose, and a phase that moves from period to period and returns, as to a clock.
 """
 
@@ -163,9 +163,9 @@ def ask_whether_driven(
 ) -> str | None:
     """The question, in one sentence, for a signal without inputs that looks driven; else None.
 
-    beside: other columns of its file, name -> (times in s, samples). Of self-sustained oscillations
-    that are moved at random, one in a hundred has a phase that returns, at most, and two have a
-    round frequency.
+    next to: other columns of its file, name -> (times in s, samples). Of self-sustained
+    oscillations that are moved at random, one in a hundred has a phase that returns, at most, and
+    two have a round frequency.
     """
     if signal.run.input_names:
         return None
@@ -174,7 +174,7 @@ def ask_whether_driven(
     for name in sorted(gains, key=lambda name: -gains[name]):
         t, u = beside[name]
         if how := describe_set(t, u, [np.interp(t, signal.t, signal.x)]):
-            why, way = f"{name} beside it looks set ({how})", f"inputs=[{name}]"
+            why, way = f"{name} next to it looks set ({how})", f"inputs=[{name}]"
             break
     else:
         if (own := _looks_driven(signal)) is None:
@@ -189,7 +189,7 @@ def ask_whether_driven(
 
 
 def report_unknown_drive(signal: Signal) -> str | None:
-    """A remark if the record shows neither a phase that walks nor one that returns; else None."""
+    """A warning if the record shows neither a phase that walks nor one that returns; else None."""
     if signal.cycle is None or signal.run.input_names:
         return None
     if PhaseRecord.of(signal.t, signal.x, signal.cycle).has_moving_phase:

@@ -120,12 +120,12 @@ def prepare_signal(
 ) -> Signal:
     """Make a trace of one variable of a run.
 
-    run: as `discover` takes it; its inputs stay beside the signal. signal: None takes the only
+    run: as `discover` takes it; its inputs stay next to the signal. signal: None takes the only
     state. decimate: number of samples that are replaced by their mean; "auto" leaves a hundred per
     period, None leaves all. detrend: whether to subtract the straight line that the signal follows
-    beside its cycle, and keep the mean; "auto" does so if the line is certain, and large beside the
-    troughs of a positive signal or beside the standard deviation of any other.
-    Raises ValueError for a signal that does not oscillate, under six periods or under six samples a
+    next to its cycle, and keep the mean; "auto" does so if the line is certain, and large next to
+    the troughs of a positive signal or next to the standard deviation of any other. Raises
+    ValueError for a signal that does not oscillate, under six periods or under six samples a
     period, or a wrong setting.
 
     >>> t = np.linspace(0.0, 1e-3, 2001)
@@ -243,7 +243,7 @@ def _remove_drift(
 
 
 def _fit_drift(t: np.ndarray, x: np.ndarray, cycle: Cycle | None) -> tuple[float, float]:
-    """Rise over the record of the line that x follows beside its cycle, and its standard error.
+    """Rise over the record of the line that x follows next to its cycle, and its standard error.
 
     What remains lasts over many samples, so its means over periods are the independent data.
     """

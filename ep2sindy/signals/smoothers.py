@@ -246,7 +246,7 @@ class WienerProcess:
         """Noise of the samples, sum of weighted squares, and log-determinant of D D' + ratio Q.
 
         weights: W of the squares of the noise. pull: p in W e - D' c = -p, half the gradient that
-        the squares have beside that of W e.
+        the squares have next to that of W e.
         """
         n, (n_samples, n_columns), root = self.differences.shape[1], values.shape, np.sqrt(ratio)
         # bands[i, j, 2 * WIDTH + k] is the entry of unknown (i, j) in the equation k further down;

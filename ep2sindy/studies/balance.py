@@ -113,7 +113,7 @@ TERMS: Metrics[TermRole] = [
 
 @dataclass(frozen=True, eq=False)
 class ModelBalance:
-    """A self-sustained model beside the balance of its zone.
+    """A self-sustained model next to the balance of its zone.
 
     processes: none if the model was not found under roles of n_i and n_n. terms: each left out in
     turn.

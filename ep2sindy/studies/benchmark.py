@@ -113,7 +113,7 @@ class Study:
     systems: names in `systems.draws.DRAWS`. noises: standard deviations of the white noise, in RMS
     of each state. n_trajectories: number of trajectories in each realization. degree: of the
     library; None takes each system's own. variants: names among the definitions. keep: whether a
-    run goes on with the finished realizations of one that was broken off.
+    run continues with the finished realizations of one that was interrupted.
     """
 
     systems: Names
@@ -260,7 +260,7 @@ def published_cells() -> pd.DataFrame:
 def add_tables(
     report: Report, outcomes: pd.DataFrame, cells: pd.DataFrame, published: pd.DataFrame
 ) -> None:
-    """Add all outcomes, and our cells beside the thesis's: as a whole, and by figure of merit."""
+    """Add all outcomes, and our cells next to the thesis's: as a whole, and by figure of merit."""
     keys, columns = ["system", "noise", "variant"], {merit: f"thesis_{merit}" for merit in MERITS}
     beside = published.rename(columns=columns)[[*keys, *columns.values()]]
     beside = cells.astype(dict.fromkeys(COUNTS, "Int64")).merge(beside, how="left", on=keys)

@@ -53,13 +53,13 @@ REPLACED = (
     "This section is about the likeliest model of the search. The rule chose another one, which "
     "was not tested against the noise."
 )
-# Nobody measured a simulation: what its samples show beside their smooth course is numerical.
+# Nobody measured a simulation: what its samples show next to their smooth course is numerical.
 THE_NOISE = "the noise of the samples (of a simulation: its numerical noise)"
 
 
 @dataclass(frozen=True, eq=False)
 class CandidateRow:
-    """A candidate of a front, or another fit of its equation beside them.
+    """A candidate of a front, or another fit of its equation next to them.
 
     left: statistics of the residuals of the model's terms relative to the noise; None if the noise
     is not known. lead: what another fit is, such as `thesis`.
@@ -121,13 +121,16 @@ def add_candidates(
 ) -> None:
     """Add the candidates of every state, their front, and terms that the data cannot distinguish.
 
-    name: of the library. note: how the rule decided. beside: other fits of the equations, by state.
+    name: of the library. note: how the rule decided. next to: other fits of the equations, by
+    state.
     """
     library, label = found.model.library, found.method.selection.label
     words = f"{len(library)} terms in {', '.join(library.variables)}; selection: "
     report.section(f"{name}: candidates", f"{words}{found.method.selection}")
     report.summary.setdefault("notes", {})[name] = note
-    report.add(*([f"selected: {note}"] if note else []), *(f"note: {n}" for n in found.remarks))
+    report.add(
+        *([f"selected: {note}"] if note else []), *(f"note: {n}" for n in found.data_warnings)
+    )
     report.add(*(f"note: {each.message}" for each in found.ambiguities if each.exact))
     if n_alike := sum(not each.exact for each in found.ambiguities):
         file = f"tables/ambiguities_{name}.csv"
@@ -216,7 +219,7 @@ ESTIMATE: Metrics[Estimate] = [
         lambda value: f"{value:.3g}".replace("nan", ""),
     ),
     Metric("delays_s", lambda found: by_state(found, found.delays_s)),
-    Metric("remarks", lambda found: list(found.remarks)),
+    Metric("data_warnings", lambda found: list(found.data_warnings)),
     Metric("flow_error", lambda found: found.flow_error),
     Metric("lack_of_fit", lambda found: found.lack_of_fit or None),
     Metric("too_few_samples", lambda found: found.too_few_samples or None),

@@ -21,7 +21,7 @@ CAPTION = (
     "Forecast from the first held-out sample on, fitted to the past alone, with the band "
     "that is to hold 90 % of the samples. Last panel: error of forecasts from starts all over the "
     "held-out part, by horizon (1: no better than the mean); persistence: the last sample "
-    "stays; harmonics: the mean cycle goes on; autoregression: linear in the samples or in their "
+    "stays; harmonics: the mean cycle continues; autoregression: linear in the samples or in their "
     "logarithms, its order by AIC; neighbours: what followed the most similar moments."
 )
 
@@ -48,7 +48,7 @@ def skill_of(
 def add_forecasts(
     report: Report, name: str, run: Trajectory, skill: ForecastSkill, *, title: str = "Forecasts"
 ) -> None:
-    """Add how far ahead a model forecasts, beside baselines: a part of the section before.
+    """Add how far ahead a model forecasts, next to baselines: a part of the section before.
 
     name: of the model, which names the files.
     """

@@ -40,7 +40,7 @@ class LibraryResult:
     runs: free runs of the selected model over every record. thesis: the published coefficients as
     printed, by state. refitted: their terms fitted to our rows, and published: the run of that
     model over the first record; None if a state has none. sustained: a model that oscillates on its
-    own; None if none was asked for, or if the library has inputs. balance: of its zone, beside the
+    own; None if none was asked for, or if the library has inputs. balance: of its zone, next to the
     self-sustained model. skill: of forecasts by the self-sustained model over its held-out part, or
     else by the selected one over the last quarter of the record, which it was fitted to; None if
     there are none.

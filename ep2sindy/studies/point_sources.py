@@ -58,7 +58,7 @@ def given_points(
     """Operating points of a config: a list, or the files of a pattern, which names the parameters.
 
     parameters: the place of each in the data group; None if it has none.
-    Raises ValueError for a pattern beside data that are not read from files, or that no file fits.
+    Raises ValueError for a pattern next to data that are not read from files, or that no file fits.
     """
     if not isinstance(points, str):
         names = list(parameters)
@@ -117,7 +117,7 @@ class OpenedPoint:
     """One operating point, and the run that was recorded there.
 
     run: None if the source says that nothing oscillates. status: as the source says. notes:
-    remarks on problems of the data. used: description of the data.
+    data-quality warnings on problems of the data. used: description of the data.
     """
 
     parameters: Point

@@ -98,8 +98,8 @@ class Study:
     that give all coefficients: the degree of polynomials, or names such as ["1", "V_D_V"]; None
     chooses them at points left out. map_points: number of points along each parameter, of a map
     over the law; None: no map. labels: names of parameters and quantities in figures. thesis:
-    published quantities by model. keep: whether a run goes on with the finished pieces of one that
-    was broken off.
+    published quantities by model. keep: whether a run continues with the finished pieces of one
+    that was interrupted.
     """
 
     source: Source
@@ -342,7 +342,7 @@ class Study:
         return library, found
 
     def _report_known(self, report: Report) -> None:
-        """Beside data of files, say what the models hold for known, and how to change it."""
+        """Next to data of files, say what the models hold for known, and how to change it."""
         known = {name: model.known for name, model in (self.models or {}).items() if model.known}
         if known and "path" in self.source.data.settings:
             name, held = list(known.items())[-1]

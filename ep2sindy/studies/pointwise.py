@@ -72,8 +72,8 @@ class Study:
     """Search an equation at every grid point, and group the points into regimes.
 
     terms: those of variables_if_present are left out if the field lacks their variables.
-    relations: between coefficients of the equations at a point. keep: whether a run goes on with
-    the finished blocks of one that was broken off. outline: the thruster whose channel is drawn
+    relations: between coefficients of the equations at a point. keep: whether a run continues with
+    the finished blocks of one that was interrupted. outline: the thruster whose channel is drawn
     into the maps.
     """
 

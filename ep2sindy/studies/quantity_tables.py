@@ -212,7 +212,7 @@ def _add_figures(
         theirs = rows_at(published, {"fit": model}).assign(kind="thesis")
         table = pd.concat([ours.assign(kind=ours["fit"].map(kinds)), theirs])
         own = {name: law for (fit, name), law in laws.items() if fit == best}
-        beside = "; beside them what the thesis found in its data" if len(theirs) else ""
+        beside = "; next to them what the thesis found in its data" if len(theirs) else ""
         line = f"; lines are the control laws of the filled marks, the fit {best}" if own else ""
         report.figure(
             f"trends_{model}",

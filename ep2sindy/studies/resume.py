@@ -1,4 +1,4 @@
-"""Runs that go on where they were broken off: what pieces depend on, and what is reported."""
+"""Runs that continue where they were interrupted: what pieces depend on, and what is reported."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def _files_named(settings: object) -> Iterator[str]:
 def resumed(
     keep: bool, report: Report, workers: Workers = ONE_BY_ONE, *, aside: Collection[str] = ()
 ) -> Iterator[KeptWorkers]:
-    """Workers that go on with the pieces that a broken run had finished, kept in the user's cache.
+    """Workers that continue with the pieces that an interrupted run left in the user's cache.
 
     keep: False begins anew and keeps nothing. aside: see `pieces_key`.
     The pieces are removed once the run has written all that it found.
@@ -94,7 +94,7 @@ def resumed(
         yield KeptWorkers(workers, folder)
     except KeyboardInterrupt:
         if folder is not None:
-            report.say("finished pieces are kept: the same command goes on with them")
+            report.say("finished pieces are kept: the same command continues with them")
         raise
     if folder is not None:
         report.when_written(partial(rmtree, folder, ignore_errors=True))

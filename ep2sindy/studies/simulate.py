@@ -44,7 +44,7 @@ MIN_SAMPLES = 16  # fewer samples cannot be drawn
 AVERAGED = " Averaged over r by area."
 CAPTIONS = {
     "current": "Discharge current over the record (above) and over the part that is shaded there, "
-    "beside the ion beam current (below).",
+    "next to the ion beam current (below).",
     "spectrum": "Power spectrum of the discharge current; breathing lies below 60 kHz, "
     "oscillations of ions in transit above.",
     "profiles": "Profiles along the axis: mean in time, the band that holds 5 to 95 % of the time, "

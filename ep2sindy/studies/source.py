@@ -159,7 +159,7 @@ def _balances(sampling: ZoneAverage, field: xr.Dataset, report: Report) -> dict[
         axisymmetric = sampling.axisymmetric
         return {n: zone_balance(field, z, axisymmetric=axisymmetric) for n, z in zones.items()}
     except ValueError as error:
-        report.say(f"the model has no balance of its zone beside it: {error}")
+        report.say(f"the model has no balance of its zone next to it: {error}")
         return {}
 
 

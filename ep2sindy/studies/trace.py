@@ -89,15 +89,15 @@ class Study:
     signal: the variable. unit: needed if the data group does not describe the signal, or to
     override its unit; None takes the described unit, or none. offset: added to the samples, in
     SI; fit finds it, for a positive signal that lost its mean.
-    inputs: columns beside the signal that drive it. period_s: of a drive that is known by its
+    inputs: columns next to the signal that drive it. period_s: of a drive that is known by its
     period, which becomes the inputs `cos_drive` and `sin_drive`.
     tried: preparations into states with their libraries, in turn (`Preparation`). Hidden states,
     found along with their equations, end the list if an exact trajectory of these explains the
     signal to its noise and sustains its oscillation. Of the others, those that forecast best where
     they were fitted are taken; of more than two states, only for a signal that does not repeat
     itself. decimate, detrend: see `prepare_signal`. held_out: the fraction at the end of the record
-    that is not fitted and serves as the test. keep: whether a run goes on with the finished
-    searches of one that was broken off. exclude, relations, rests_at_zero: known of the equations,
+    that is not fitted and serves as the test. keep: whether a run continues with the finished
+    searches of one that was interrupted. exclude, relations, rests_at_zero: known of the equations,
     see `StatedFacts`.
     """
 
@@ -151,10 +151,10 @@ class Study:
         self._report_choice(signal, best, skill, report, linear=linear)
         seen = len(best.states.signal.t) == len(signal.t)
         where = "all of it, too short to hold out" if seen else "its end, which was not fitted"
-        remarks = [Text(free.caution, warning=True)] if free.caution else []
+        data_warnings = [Text(free.caution, warning=True)] if free.caution else []
         is_sustained = free.status is Status.SUSTAINED and not question
-        if is_sustained and (remark := report_unknown_drive(signal)):
-            remarks.append(Text(remark))
+        if is_sustained and (data_warning := report_unknown_drive(signal)):
+            data_warnings.append(Text(data_warning))
         report.found(
             found_model(
                 f"Found from {signal.name}",
@@ -162,7 +162,7 @@ class Study:
                 file=NAME,
                 picture=f"free_run_{NAME}",
                 skill=skill,
-                more=remarks,
+                more=data_warnings,
                 where=where,
                 seen=seen,
                 lack_of_fit=best.found.lack_of_fit,
@@ -286,7 +286,7 @@ def _add_signal(
         f"states: {embedding.says}, {', '.join(states.state_names)} ({best.states.reason})"
         f"{'; known: ' if exact else ''}{exact}",
         f"noise{too_fast}: {noise}, {fraction:.2g} % of the standard deviation",
-        f"process noise, which moves the states at random beside the model in a step: {moves} (SI)",
+        f"process noise, which moves the states at random in a step, besides the model: {moves} (SI)",
         *signal.done,
     )
     chosen = [attempts.index(best)]

@@ -200,7 +200,7 @@ def frequency_words(run: Evaluation, form: str = "+.1f") -> str:
 
 
 def run_words(run: Evaluation) -> str:
-    """Frequency, amplitude and waveform of a run beside the data's, as far as they are known."""
+    """Frequency, amplitude and waveform of a run next to the data's, as far as they are known."""
     found = []
     if (frequency := frequency_words(run, "+.2g")) != "-":
         found.append(f"frequency {frequency}")
@@ -224,7 +224,7 @@ def _size(ratio: float) -> str:
 
 
 COMPARED = View.FILES | View.HEADLINE
-# How a model runs beside a record: of every model, in every study.
+# How a model runs next to a record: of every model, in every study.
 EVALUATION: Metrics[Evaluation] = [
     Metric("from_s", lambda run: float(run.record.t[0])),
     Metric("to_s", lambda run: float(run.record.t[-1])),

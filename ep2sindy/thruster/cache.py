@@ -21,7 +21,7 @@ from ep2sindy.thruster.axial.settings import to_json
 
 MADE_OF = "kept_for"  # attribute: the parameters of a kept result
 
-# Source text on which a kept result depends: this room, and what sets the status of a record.
+# Source text on which a kept result depends: this subpackage, and what sets the status of a record.
 SOURCES = [Path(__file__).parent, Path(str(spectrum.__file__))]
 
 

@@ -33,7 +33,7 @@ def ionization_rate(
         raise ValueError(f"R_ion needs T_e_eV; this field has {list(field.data_vars)}")
     if table is not None and gas != "xenon":
         raise ValueError(
-            f"a table says the rates of its own gas, got gas={gas!r} beside {table}; leave one out"
+            f"a table says the rates of its own gas, got gas={gas!r} next to {table}; leave one out"
         )
     T_e_eV = field["T_e_eV"].astype(np.float64)
     rate: Callable = propellants.ionization_rate

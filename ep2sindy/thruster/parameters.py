@@ -73,7 +73,7 @@ class ModulatedVoltage:
             )
 
     def check(self, voltage: float, end_s: float) -> None:
-        """Nothing: it goes on for ever, about any voltage."""
+        """Nothing: it continues for ever, about any voltage."""
 
     def at(self, t: Volts, voltage: float) -> Volts:
         """Voltage in V at times in s, constant before t = 0."""
@@ -139,7 +139,7 @@ class Background:
     """The facility's residual gas, of the same kind as the propellant.
 
     The channel takes in ingestion p/(k_B T) sqrt(8 k_B T/(pi m))/4 per area, the flux of a gas at
-    rest, beside the anode's flow. pressure_Pa: 1e-5 Torr are 1.33e-3 Pa. ingestion: factor on that
+    rest, next to the anode's flow. pressure_Pa: 1e-5 Torr are 1.33e-3 Pa. ingestion: factor on that
     flux, as gas enters from the plume, too. A `PressureShift` follows the pressure.
     Raises ValueError for a pressure or ingestion below 0, or a temperature that is not positive.
     """
@@ -241,7 +241,7 @@ class Thruster:
         if self.circuit is not None and self.series_resistance == 0.0:
             raise ValueError(
                 "a circuit must have a resistance, or nothing damps it: series_resistance is 0 "
-                f"beside {self.circuit}; give it in ohm"
+                f"next to {self.circuit}; give it in ohm"
             )
         self.magnetic_field.check_covers(
             -self.channel_length, self.domain_length - self.channel_length

@@ -25,9 +25,9 @@ def read_hallthruster(path: Path) -> FileSource:
 
     Values are in SI, except Tev in eV. A name is a path inside a frame, with indices from 0:
     `ions.Xe.0.n` (density of Xe+), `neutrals.Xe.n`, `Tev`, `discharge_current`, time `t`, grid `z`.
-    Supported layouts: versions 0.19 to 0.22 (output.frames); frames with `t` and `grid` beside
+    Supported layouts: versions 0.19 to 0.22 (output.frames); frames with `t` and `grid` next to
     them; 0.18 (`ni.0`, `ui.0`, `nn`) and earlier (`ni_1`), a bare list of frames; without frames,
-    plain columns. Data beside the frames are named by their path from the top.
+    plain columns. Data next to the frames are named by their path from the top.
     Source: https://um-pepl.github.io/HallThruster.jl (Use JSON for input and output).
     """
     content = read_json(path.read_text(encoding="utf-8-sig"))
@@ -52,7 +52,7 @@ def read_hallthruster(path: Path) -> FileSource:
 
 
 def _split_frames(content: Any) -> tuple[Sequence[Mapping[str, Any]], Any]:
-    """Split the content into the frames and the data beside them."""
+    """Split the content into the frames and the data next to them."""
     if isinstance(content, list):
         frames, beside = content, {}
     else:

@@ -87,7 +87,7 @@ def _beside(path: Path) -> dict[str, xr.DataArray]:
 
 
 def _mesh(name: str, item: h5py.Group | h5py.Dataset) -> dict[str, xr.DataArray]:
-    """Coordinates of a mesh of openPMD in m, called as its axes, beside the mesh.
+    """Coordinates of a mesh of openPMD in m, called as its axes, next to the mesh.
 
     Source: openPMD standard 1.1.0, mesh based records.
     """

@@ -139,7 +139,7 @@ def _rate(table: Sequence[Sequence[str]], decimal: str) -> tuple[float, int, tup
 def _numeric(rows: Sequence[Sequence[str]], decimal: str) -> tuple[int, ...]:
     """Indices of the columns most of whose cells, but for missing samples, are numbers.
 
-    Of a table with labels beside it, columns that few rows fill belong to these.
+    Of a table with labels next to it, columns that few rows fill belong to these.
     """
     filled = {}
     for j, column in enumerate(zip_longest(*rows, fillvalue="")):

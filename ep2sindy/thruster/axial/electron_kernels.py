@@ -133,8 +133,8 @@ def follow_circuit(state, model, dt, behind):
 def drive_and_load(n, per_n, g, T, per_mobility, gradient, model):
     """Integrals over the plasma of Ohm's law; writes the pressure gradient in eV/m^4.
 
-    The first, in V, drives the current beside the supply; the second is the resistance, times e and
-    the channel's area.
+    The first, in V, drives the current next to the supply; the second is the resistance, times e
+    and the channel's area.
     """
     dz, per_span, per_spread = model.dz, model.per_span, model.per_spread
     drive = load = 0.0

@@ -51,7 +51,7 @@ class Beginning(NamedTuple):
     """A first state, and how a run continues from it.
 
     whole: whether the state is complete, as left by another run. resistance: series resistance in
-    ohm during the first hold_s, before the run begins; None takes the thruster's. note: remark on
+    ohm during the first hold_s, before the run begins; None takes the thruster's. note: warning on
     the start.
     """
 
@@ -251,7 +251,7 @@ def _ended_run(run: xr.Dataset | str | Path) -> xr.Dataset:
     if not isinstance(run, xr.Dataset):
         path = Path(run)
         if not path.is_file():
-            raise ValueError(f"no such run to go on from: {path.absolute()}")
+            raise ValueError(f"no such run to continue from: {path.absolute()}")
         with (
             damage_named(path),
             xr.open_dataset(path, engine="h5netcdf", decode_times=False) as stored,
@@ -265,7 +265,7 @@ def _ended_run(run: xr.Dataset | str | Path) -> xr.Dataset:
         )
     if run.attrs["status"] == "diverged":
         raise ValueError(
-            "a run goes on only from one that lived: this one diverged, and its end is no physics; "
+            "a run continues only from one that did not diverge, and this one did: its end is no physics; "
             "start from ColdStart or SoftStart"
         )
     return run
@@ -277,6 +277,6 @@ def _check_same_thruster(theirs: str, ours: str) -> None:
     for name in FIXED:
         if before.get(name) != now.get(name):
             raise ValueError(
-                f"a run goes on only in the same thruster: {name} was {before.get(name)} and is "
+                f"a run continues only in the same thruster: {name} was {before.get(name)} and is "
                 f"{now.get(name)}; start from ColdStart or SoftStart"
             )

@@ -30,7 +30,7 @@ FAST: dict[str, Any] = {
     "forceinline": True,
 }
 # For functions whose array arguments are separate ones: the compiler need not look whether a value
-# written is read by the next. Never pass one array twice, nor a row beside the matrix that has it.
+# written is read by the next. Never pass one array twice, nor a row next to the matrix that has it.
 LOOP: dict[str, Any] = {**FAST, **SEPARATE_ARRAYS}
 NO_NAN: dict[str, Any] = {**LOOP, "fastmath": {*FAST["fastmath"], "nnan"}}  # for a maximum
 
@@ -70,8 +70,8 @@ class AxialModel(NamedTuple):
 
     dz: np.ndarray  # (n + 2,), m: lengths of the cells
     inverse_dz: np.ndarray  # (n + 2,), 1/m
-    per_between: np.ndarray  # (n + 1,), 1/m: of the distance of the centres beside each face
-    per_span: np.ndarray  # (n + 2,), 1/m: of the distance of the centres beside each cell
+    per_between: np.ndarray  # (n + 1,), 1/m: of the distance of the centres next to each face
+    per_span: np.ndarray  # (n + 2,), 1/m: of the distance of the centres next to each cell
     to_left: np.ndarray  # (n + 2,): length of a cell over the distance to its left neighbour
     to_right: np.ndarray  # (n + 2,)
     slope_weight: float  # 1: van Leer's slopes; 0: none
@@ -113,7 +113,7 @@ class AxialModel(NamedTuple):
     wall_power_weight: np.ndarray
     table: np.ndarray  # (temperatures, columns), as `closure_table` fills it
     table_step_eV: float
-    further: np.ndarray  # (k, 2): charges before and after the ionisations beside X -> X+
+    further: np.ndarray  # (k, 2): charges before and after the ionisations next to X -> X+
     further_eV: np.ndarray  # (k,), their energies
 
 

@@ -47,7 +47,7 @@ def velocities(gas, model):
 
 @compiled(**FAST)
 def repeat_exit(gas, model):
-    """Masked cells beside the exit repeat the plume's, for zero slopes."""
+    """Masked cells next to the exit repeat the plume's, for zero slopes."""
     i = model.exit_column
     for j in range(model.lower[i], model.upper[i]):
         if j < model.lower[i - 1] or j >= model.upper[i - 1]:
@@ -110,7 +110,7 @@ def cathode_fluxes(here, model, fluxes):
 
 @compiled(**FAST)
 def front_fluxes(plume, model, fluxes):
-    """The thruster's front face beside the exit: ions that reach it return as neutrals.
+    """The thruster's front face next to the exit: ions that reach it return as neutrals.
 
     plume: its first column. Returns ions lost per second.
     """
@@ -129,7 +129,7 @@ def front_fluxes(plume, model, fluxes):
 
 @compiled(**LOOP)
 def radial_slopes(here, slopes, start, stop):
-    """Half slopes along r of ions and their velocities; zero beside the walls."""
+    """Half slopes along r of ions and their velocities; zero next to the walls."""
     last = stop - ONE
     slopes.n[start] = slopes.u_z[start] = slopes.u_r[start] = 0.0
     slopes.n[last] = slopes.u_z[last] = slopes.u_r[last] = 0.0

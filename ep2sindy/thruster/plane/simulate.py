@@ -313,7 +313,7 @@ def build_model(thruster: Thruster, point: OperatingPoint, grid: MaskedGrid) -> 
 
 
 def initial_state(grid: MaskedGrid, model: kernels.PlaneModel) -> kernels.PlaneState:
-    """A smooth first guess, uniform in r except for a thin plasma beside the beam."""
+    """A smooth first guess, uniform in r except for a thin plasma next to the beam."""
     shape = (grid.n_z, grid.n_r)
     z = grid.z / grid.thruster.channel_length  # 1 at the exit
     beam = np.zeros(grid.n_r, dtype=bool)

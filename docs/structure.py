@@ -1,8 +1,9 @@
-"""Draw the house: rooms of the package and who imports whom, from the imports themselves.
+"""Draw the structure: subpackages of the package and who imports whom, from the imports themselves.
 
-    python docs/house.py        # writes docs/house.svg; a test holds the drawing to the code
+    python docs/structure.py        # writes docs/structure.svg; a test holds the drawing to the
+    code
 
-A room stands above all that it imports. An arrow that a longer way implies is left out.
+A subpackage stands above all that it imports. An arrow that a longer way implies is left out.
 """
 
 from __future__ import annotations
@@ -13,11 +14,11 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "ep2sindy"
-DRAWING = ROOT / "docs" / "house.svg"
+DRAWING = ROOT / "docs" / "structure.svg"
 WIDTH, GAP, LINE = 1080, 40, 15
 
 
-def rooms() -> dict[str, list[str]]:
+def subpackages() -> dict[str, list[str]]:
     """Room -> its modules, both in order of their names."""
     found = {}
     for folder in sorted(path for path in PACKAGE.iterdir() if (path / "__init__.py").exists()):
@@ -27,11 +28,11 @@ def rooms() -> dict[str, list[str]]:
 
 
 def arrows() -> dict[str, set[str]]:
-    """Room -> the rooms that any of its modules imports, at once or later."""
+    """Room -> the subpackages that any of its modules imports, at once or later."""
     found: dict[str, set[str]] = {}
-    known = set(rooms())
-    for room in rooms():
-        trees = [ast.parse(p.read_text("utf-8")) for p in (PACKAGE / room).rglob("*.py")]
+    known = set(subpackages())
+    for subpackage in subpackages():
+        trees = [ast.parse(p.read_text("utf-8")) for p in (PACKAGE / subpackage).rglob("*.py")]
         names = {
             node.module or ""
             for tree in trees
@@ -39,19 +40,19 @@ def arrows() -> dict[str, set[str]]:
             if isinstance(node, ast.ImportFrom)
         }
         there = {name.split(".")[1] for name in names if name.startswith("ep2sindy.")}
-        found[room] = there & known - {room}
+        found[subpackage] = there & known - {subpackage}
     return found
 
 
 def direct(below: dict[str, set[str]]) -> dict[str, set[str]]:
     """Arrows without those that a longer way implies."""
 
-    def reached(room: str) -> set[str]:
-        return below[room].union(*(reached(each) for each in below[room]))
+    def reached(subpackage: str) -> set[str]:
+        return below[subpackage].union(*(reached(each) for each in below[subpackage]))
 
     return {
-        room: {each for each in there if not any(each in reached(o) for o in there - {each})}
-        for room, there in below.items()
+        subpackage: {each for each in there if not any(each in reached(o) for o in there - {each})}
+        for subpackage, there in below.items()
     }
 
 
@@ -59,26 +60,26 @@ def floors(below: dict[str, set[str]]) -> list[list[str]]:
     """Rooms by height: one above the highest that it imports."""
     height: dict[str, int] = {}
     while len(height) < len(below):
-        for room, there in below.items():
-            if room not in height and there <= set(height):
-                height[room] = 1 + max((height[each] for each in there), default=-1)
+        for subpackage, there in below.items():
+            if subpackage not in height and there <= set(height):
+                height[subpackage] = 1 + max((height[each] for each in there), default=-1)
     return [
-        sorted(room for room, h in height.items() if h == level)
+        sorted(subpackage for subpackage, h in height.items() if h == level)
         for level in range(max(height.values()) + 1)
     ]
 
 
 def drawing() -> str:
     """The whole picture as SVG, the ground floor at the bottom."""
-    inside, below = rooms(), arrows()
+    inside, below = subpackages(), arrows()
     boxes: dict[str, tuple[float, float, float, float]] = {}
     y = 20.0
     for floor in reversed(floors(below)):
         width = min(640.0, (WIDTH - 20.0) / len(floor) - 20.0)
-        tall = max(_height(inside[room], width) for room in floor)
+        tall = max(_height(inside[subpackage], width) for subpackage in floor)
         left = (WIDTH - len(floor) * (width + 20.0) + 20.0) / 2
-        for k, room in enumerate(floor):
-            boxes[room] = (left + k * (width + 20.0), y, width, tall)
+        for k, subpackage in enumerate(floor):
+            boxes[subpackage] = (left + k * (width + 20.0), y, width, tall)
         y += tall + GAP
     lines = [
         _arrow(boxes[a], boxes[b]) for a, there in direct(below).items() for b in sorted(there)
@@ -91,7 +92,7 @@ def drawing() -> str:
             '<defs><marker id="tip" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="7" '
             'markerHeight="7" orient="auto"><path d="M0 0 8 4 0 8z" fill="#666"/></marker></defs>',
             *lines,
-            *(_box(room, inside[room], boxes[room]) for room in inside),
+            *(_box(subpackage, inside[subpackage], boxes[subpackage]) for subpackage in inside),
             "</svg>\n",
         ]
     )
@@ -106,7 +107,7 @@ def _height(modules: list[str], width: float) -> float:
     return 30.0 + LINE * rows
 
 
-def _box(room: str, modules: list[str], box: tuple[float, float, float, float]) -> str:
+def _box(subpackage: str, modules: list[str], box: tuple[float, float, float, float]) -> str:
     x, y, width, height = box
     n = _columns(width)
     names = "".join(
@@ -118,7 +119,7 @@ def _box(room: str, modules: list[str], box: tuple[float, float, float, float]) 
         f'<rect x="{x:.0f}" y="{y:.0f}" width="{width:.0f}" height="{height:.0f}" rx="4" '
         'fill="#eef4fa" stroke="#4a7bab"/>'
         f'<text x="{x + 10:.0f}" y="{y + 18:.0f}" font-weight="bold" font-size="13">'
-        f"{escape(room)}/</text>{names}"
+        f"{escape(subpackage)}/</text>{names}"
     )
 
 
