@@ -7,7 +7,7 @@
 `+exp=trace` as it comes is run on every record; what differs is written with its row. Errors are
 root mean squares over starts, in standard deviations of the held-out samples, next to persistence
 and an autoregression by AIC; every start is fitted to the past alone. Records that are not shipped
-lie in the folder of EP2SINDY_DATA. Prints the tables of docs/measured.md.
+lie in the folder of EP2SINDY_DATA. Prints the tables of docs/trace.md.
 
 `sentences` tests what heads the result, over all records and over signals that follow a square
 wave or are noise about a sine: whether the held-out part bears it out, whether a driven signal is

@@ -48,7 +48,7 @@ def record(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return scope(tmp_path_factory.mktemp("scope") / "scope.csv", *signal(24.0))
 
 
-def test_hidden_states_that_are_a_lack_of_fit_are_shown_if_they_are_asked_for(tmp_path: Path) -> None:
+def test_hidden_states_that_do_not_fit_are_shown_if_asked_for(tmp_path: Path) -> None:
     t = np.linspace(0.0, 50.0, 501)
     path = scope(tmp_path / "scope.csv", t, np.sin(t) ** 3)  # no linear equations make it
     found = computed(composed(*glance(path, tmp_path, "tried=[{how: hidden, degree: 1}]")))
@@ -58,7 +58,7 @@ def test_hidden_states_that_are_a_lack_of_fit_are_shown_if_they_are_asked_for(tm
     assert not found.summary["models"]["trace"]["intervals"]
 
 
-def test_one_column_of_a_file_becomes_a_model_that_is_sustained(record: Path, tmp_path: Path) -> None:
+def test_one_column_of_a_file_becomes_a_sustained_model(record: Path, tmp_path: Path) -> None:
     folder = run_config(composed(*toy(record, tmp_path, "tried=[{how: rate}]")))
     summary = summary_of(folder)
     run = summary["evaluations"]["trace"]

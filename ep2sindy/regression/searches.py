@@ -34,7 +34,7 @@ Squares = Float[np.ndarray, " problems"]
 class Search(Protocol):
     """Interface that turns the Gram matrix of one equation into candidate supports.
 
-    One of your own in twenty lines is in docs/architecture.md.
+    One of your own in twenty lines is in docs/contributing.md.
     xx: (terms, terms) and xy: (terms,) of columns with unit norm; yy: squared norm of the target.
     A column of zeros is a term that is not available, and must not appear in a support.
     """

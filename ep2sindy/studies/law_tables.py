@@ -297,7 +297,7 @@ def _add_left_out(report: Report, found: FoundLaw) -> None:
             f"none of {len(found.runs)} points left out is sustained by the law of the others, "
             "so it "
             "predicts none between them: try points that lie closer together, other models, or "
-            "models=null, longer records, and inputs that are states (docs/parametric.md)"
+            "models=null, longer records, and inputs that are states (docs/points.md)"
         )
 
 

@@ -286,7 +286,7 @@ def _add_signal(
         f"states: {embedding.says}, {', '.join(states.state_names)} ({best.states.reason})"
         f"{'; known: ' if exact else ''}{exact}",
         f"noise{too_fast}: {noise}, {fraction:.2g} % of the standard deviation",
-        f"process noise, which moves the states at random in a step, besides the model: {moves} (SI)",
+        f"process noise, which moves the states at random in every step: {moves} (SI)",
         *signal.done,
     )
     chosen = [attempts.index(best)]

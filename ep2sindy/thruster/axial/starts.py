@@ -265,8 +265,8 @@ def _ended_run(run: xr.Dataset | str | Path) -> xr.Dataset:
         )
     if run.attrs["status"] == "diverged":
         raise ValueError(
-            "a run continues only from one that did not diverge, and this one did: its end is no physics; "
-            "start from ColdStart or SoftStart"
+            "a run continues only from one that did not diverge, and this one did: its end "
+            "is no physics; start from ColdStart or SoftStart"
         )
     return run
 
