@@ -35,14 +35,14 @@ def front_figure(found: ep.Discovery) -> Figure:
 
 
 def runs_figure(
-    held_out: ep.Trajectory, dead: ep.model.Evaluation, free: ep.model.Evaluation
+    held_out: ep.Trajectory, decaying: ep.model.Evaluation, free: ep.model.Evaluation
 ) -> Figure:
     figure, axes = make_panels(1, 1, (7.6, 2.6))
     ax, since = axes[0, 0], 1e3 * (held_out.t - held_out.t[0])
     n = int(SHOWN_S / held_out.dt_s)
     ax.plot(since[:n], held_out.states[:n, 0], color=DATA, lw=2.6, alpha=0.35, label="data")
     for run, colour, words in (
-        (dead, COLOURS[1], "selected by the fit of the derivative"),
+        (decaying, COLOURS[1], "selected by the fit of the derivative"),
         (free, COLOURS[0], "selected by free runs"),
     ):
         ax.plot(since[:n], run.rollout.states[:n, 0], color=colour, lw=1.2, label=words)
@@ -58,7 +58,7 @@ def main() -> None:
         if block.language == "python":
             exec(compile(block.text, "beginners.md", "exec"), known)
     front_figure(known["found"]).savefig(DOCS / "beginners_front.png", dpi=130)
-    runs = runs_figure(known["held_out"], known["dead"], known["free"])
+    runs = runs_figure(known["held_out"], known["decaying"], known["free"])
     runs.savefig(DOCS / "beginners_runs.png", dpi=130)
 
 

@@ -135,7 +135,7 @@ def test_the_config_of_a_study_of_ones_own_runs(here: Path) -> None:
     assert len(found.report.tables["map"]) == 2
 
 
-def test_the_experiment_of_the_page_on_architecture_runs(here: Path) -> None:
+def test_the_experiment_of_the_page_on_contributing_runs(here: Path) -> None:
     """On oscillations that decay and grow at known rates; the window is three of their periods."""
     t = 0.1 * np.arange(2000.0)
     turns = 2.0 * np.pi * t / 5.0
@@ -145,8 +145,8 @@ def test_the_experiment_of_the_page_on_architecture_runs(here: Path) -> None:
         "y": np.exp(0.02 * t) * np.sin(turns),
     }
     pd.DataFrame(record).to_csv("run.csv", index=False)
-    page = (ROOT / "docs" / "architecture.md").read_text("utf-8")
-    (config,) = (b.text for b in blocks(ROOT / "docs" / "architecture.md") if b.language == "yaml")
+    page = (ROOT / "docs" / "contributing.md").read_text("utf-8")
+    (config,) = (b.text for b in blocks(ROOT / "docs" / "contributing.md") if b.language == "yaml")
     write_modules(page)
     given = [*DATA["my_growth"], "window_s=15.0", "output=outputs"]
     found = computed(composed_with("exp", "my_growth", config, "+exp=my_growth", *given))
