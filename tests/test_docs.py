@@ -309,7 +309,7 @@ def is_of(quote: str, text: str) -> bool:
 
 
 def test_every_experiment_is_on_the_page_that_leads_to_one() -> None:
-    page = (ROOT / "docs" / "which.md").read_text("utf-8")
+    page = (ROOT / "docs" / "index.md").read_text("utf-8")
     assert set(re.findall(r"\+exp=(\w+)", page)) == set(EXPERIMENTS)
     commands_given = re.findall(r"`(ep2sindy \+exp=[^`]*)`", page)
     options = re.findall(r"`('[a-z.]+=[^`]*')`", page)  # for the same command

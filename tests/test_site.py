@@ -51,7 +51,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
         "beginners",
         "tutorial",
         "pysindy",
-        "mathematics",
+        "method",
         "reference/index",
         "reference/data",
     ],

@@ -244,7 +244,7 @@ class Study:
         rng: np.random.Generator,
         progress: Progress,
     ) -> LibraryResult:
-        """Discovery of one library in all records, and its free runs; a sustained one of the first."""
+        """Discovery of one library in all records, and free runs; a sustained one of the first."""
         measured = runs[0]
         barred = {state: list(map(str, names)) for state, names in (self.exclude or {}).items()}
         known = library.exclude(barred).relate(*self.relations).with_roles(self.roles)
