@@ -184,7 +184,7 @@ def left_over_of_all(tests: Sequence[NoiseTest]) -> list[Text]:
     size = f"{ratios[0]:.3g} to {ratios[-1]:.3g} times {THE_NOISE}" if left else "more than noise"
     text = (
         f"The equations fitted to derivatives leave {size}: a state or a term is missing there, so "
-        "they have no intervals; the free run above is what tests."
+        "they have no intervals; the free run above is the test."
     )
     return [Text(text)]
 
