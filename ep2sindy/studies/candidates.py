@@ -126,7 +126,7 @@ def add_candidates(
     """
     library, label = found.model.library, found.method.selection.label
     words = f"{len(library)} terms in {', '.join(library.variables)}; selection: "
-    report.section(f"{name}: candidates", f"{words}{found.method.selection}")
+    report.section(f"{name}: candidate equations", f"{words}{found.method.selection}")
     report.summary.setdefault("notes", {})[name] = note
     report.add(
         *([f"selected: {note}"] if note else []), *(f"note: {n}" for n in found.data_warnings)
@@ -233,7 +233,7 @@ def add_estimate(report: Report, name: str, found: Discovery) -> None:
     """
     estimate = found.estimate
     assert estimate is not None
-    report.section(f"{name}: what the samples say", level=3)
+    report.section(f"{name}: noise of the samples, and other supports", level=3)
     if not found.noise_test.tested:
         report.add(Text(REPLACED, warning=True))
     rows = ResultTable([estimate], ESTIMATE)
