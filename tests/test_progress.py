@@ -12,7 +12,7 @@ import pytest
 
 import ep2sindy as ep
 from ep2sindy._stubs import dotted_names
-from ep2sindy.runtime.progress import SILENT, Bars, Stated, as_progress, count_pieces
+from ep2sindy.runtime.progress import SILENT, Bars, CallbackProgress, as_progress, count_pieces
 
 LIBRARY = ep.polynomial(["x", "y"], degree=2)
 BRIEF = {"duration_s": 3e-5, "warm_up_s": 3e-6}
@@ -140,7 +140,7 @@ def test_true_means_bars_and_a_function_is_stated() -> None:
     watch, numbers = Recorder(), []
     assert as_progress(watch) is watch
     stated = as_progress(numbers.append)
-    assert isinstance(stated, Stated)
+    assert isinstance(stated, CallbackProgress)
     with stated.stage(2, "point") as advance:
         advance(2)
     assert numbers == [2]
