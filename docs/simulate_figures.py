@@ -1,4 +1,4 @@
-"""Draw the figures of docs/thruster.md that show single runs and a scan.
+"""Draw the figures of docs/thruster.md by the commands that it names.
 
 python docs/simulate_figures.py     # some minutes; prints what docs/thruster.md quotes
 """
