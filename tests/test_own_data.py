@@ -259,7 +259,8 @@ def test_downstream_is_the_last_part_of_a_channel_that_is_known() -> None:
     assert words_of_it == "average over z 0 to 25 mm (5 of 10 points), the channel, 25 mm"
     simulated = GRID.assign_attrs(parameters=json.dumps({"thruster": {"channel_length": 0.025}}))
     assert average.place(simulated) == words
-    assert ep.data.GridPoint(["n_i"], z=0.018).place(GRID) == "the grid point at z = 17.5 mm"
+    at_a_point = ep.data.ZoneAverage(["n_i"], ep.Zone(z=0.018)).place(GRID)
+    assert at_a_point == "average over z = 17.5 mm (one grid point)"
 
 
 def test_a_channel_that_is_not_known_is_asked_for() -> None:
