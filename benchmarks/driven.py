@@ -377,7 +377,8 @@ def questions() -> None:
                 at_frequency(run, ROUND_HZ if round_ else any_frequency(rng))
                 for run, rng in zip(made, generators(), strict=True)
             ]
-            how = f"{'500 Hz' if round_ else 'any frequency'}, process noise of {100 * process_noise:.0f} %"
+            how = "500 Hz" if round_ else "any frequency"
+            how = f"{how}, process noise of {100 * process_noise:.0f} %"
             tell(f"{name}, {how}, {n} periods", runs)
 
 
