@@ -250,7 +250,7 @@ def test_downstream_is_the_last_part_of_a_channel_that_is_known() -> None:
     np.testing.assert_array_equal(run.states, by_hand.states)
     words = average.place(known)
     assert words == (
-        "average over z 15 to 25 mm (2 of 10 points), the last 40% of the channel, 25 mm"
+        "average over z 15 to 25 mm (2 of 10 points), the last 40 % of the channel, 25 mm"
     )
     whole = ep.zone_average(known, ep.Zone(z="channel"), states=["n_i"])
     by_hand = ep.zone_average(GRID, ep.Zone(z=(0.0, 0.025)), states=["n_i"])

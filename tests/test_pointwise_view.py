@@ -67,7 +67,7 @@ def test_medians_come_with_their_spread_and_the_share_of_points(folder: Path) ->
     lines = (folder / "run.log").read_text().splitlines()
     rows = [[cell.strip() for cell in line.split("│")] for line in lines]
     for acts, cells in (
-        ("bold", ["n_n'", "1", "100%", "1e+22", "1e+22", "7.12e+22", "m^-3 s^-1"]),
+        ("bold", ["n_n'", "1", "100 %", "1e+22", "1e+22", "7.12e+22", "m^-3 s^-1"]),
         # Two of seven points have it, and it does not act.
         ("", ["n_n'", "1", "29%", "1e+20", "1e+20", "1e+20", "m^-3 s^-1"]),
     ):
@@ -79,8 +79,8 @@ def test_medians_come_with_their_spread_and_the_share_of_points(folder: Path) ->
 
 def test_points_of_low_confidence_are_counted(folder: Path) -> None:
     for text in stated(folder):
-        assert "3 regimes; confidence below 0.5 at 9% of points" in text
-        assert "Regime 1: 3 points, confidence 0.67, below 0.5 at 33%" in text
+        assert "3 regimes; confidence below 0.5 at 9 % of points" in text
+        assert "Regime 1: 3 points, confidence 0.67, below 0.5 at 33 %" in text
 
 
 def test_a_study_without_any_term_has_no_table_of_them(tmp_path: Path) -> None:

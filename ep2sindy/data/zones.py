@@ -245,7 +245,11 @@ def _at_peak(field: xr.Dataset) -> str:
 
 
 def _part_text(name: str) -> str:
-    return "the channel" if PARTS[name] == 1.0 else f"the last {PARTS[name]:.0%} of the channel"
+    return (
+        "the channel"
+        if PARTS[name] == 1.0
+        else f"the last {100.0 * PARTS[name]:.0f} % of the channel"
+    )
 
 
 def _nearest(points: Float[np.ndarray, " points"], place: float, axis: str) -> int:
