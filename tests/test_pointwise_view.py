@@ -69,11 +69,12 @@ def test_medians_come_with_their_spread_and_the_share_of_points(folder: Path) ->
     for acts, cells in (
         ("bold", ["n_n'", "1", "100 %", "1e+22", "1e+22", "7.12e+22", "m^-3 s^-1"]),
         # Two of seven points have it, and it does not act.
-        ("", ["n_n'", "1", "29%", "1e+20", "1e+20", "1e+20", "m^-3 s^-1"]),
+        ("", ["n_n'", "1", "29 %", "1e+20", "1e+20", "1e+20", "m^-3 s^-1"]),
     ):
         assert cells in rows
         state, term, fraction = cells[:3]
-        row = f'<td>{state}</td><td>{term}</td><td class="number">{fraction}</td>'
+        row = f'<td class="short">{state}</td><td class="short">{term}</td>'
+        row += f'<td class="number">{fraction}</td>'
         assert f'<tr class="{acts}">{row}' in html
 
 

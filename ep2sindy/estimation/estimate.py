@@ -439,6 +439,6 @@ def _open_choice(
         return ""
     return (
         f"{problem.n_samples} samples do not tell these equations from others: the chance that all "
-        f"terms are right is {100.0 * fraction:.0f} %; name the terms that you know (Library.only), take a "
-        "smaller library, or a longer record"
+        f"terms are right is {100.0 * fraction:.0f} %; name the terms that you know "
+        "(Library.only), take a smaller library, or a longer record"
     )

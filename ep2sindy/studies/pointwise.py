@@ -234,9 +234,10 @@ def _add_regime(report: Report, regimes: Regimes, regime: int) -> None:
     """Add a part on one regime: its equations, and the spread of coefficients over its points."""
     rows = regimes.table[regimes.table["regime"] == regime]
     first = rows.iloc[0]
+    unsure = f"below {UNSURE:g} at {100.0 * first['unsure']:.0f} %"
     report.section(
         f"Regime {regime}: {first['n_points']} point{'s' if first['n_points'] > 1 else ''}, "
-        f"confidence {first['confidence']:.2f}, below {UNSURE:g} at {100.0 * first['unsure']:.0f} %",
+        f"confidence {first['confidence']:.2f}, {unsure}",
         *(Equation(s, terms, on_screen=True) for s, terms in regimes.equations(regime).items()),
         level=3,
     )
