@@ -67,7 +67,7 @@ def test_noise_is_no_obstacle():
     # On the data's cycle; from one sample its phase may be off by more than a first period allows.
     assert assessed.status in (ep.model.Status.SUSTAINED, ep.model.Status.WRONG_FREQUENCY)
     assert abs(assessed.f_error) < 0.01
-    # It lives, and yet it is not the truth: it leaves more than noise, and has no intervals.
+    # It is sustained, and yet it is not the truth: it leaves more than noise, and has no intervals.
     assert noisy.lack_of_fit
     assert noisy.model.covariance is None
 

@@ -37,7 +37,7 @@ class PenalisedFit:
 
 
 def term_penalties(problem: EstimationProblem, n_samples: float) -> ByCoefficient:
-    """Price of each coefficient: the fall of the squares that justifies it.
+    """Penalty of each coefficient: the fall of the squares that justifies it.
 
     The penalty is log n plus a cost of choosing among terms. A term of degree q is one of d C(d +
     q, q), and every degree above the first is half as likely a priori as the one below; a constant
