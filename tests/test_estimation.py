@@ -497,10 +497,8 @@ def test_the_search_is_the_same_in_other_units() -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"selection": ep.EBIC()}, r"selection must be Evidence\(\)"),
-        ({"max_terms": 0}, "max_terms must be a whole number, one or more, got 0"),
+        ({"selection": ep.EBIC()}, "selection must be Evidence"),
         ({"limit_s": 0.0}, "limit_s must be positive, in s, or None"),
-        ({"limit_s": np.nan}, "limit_s must be positive, in s, or None"),
     ],
 )
 def test_settings_that_do_not_go_with_trajectories_are_refused(
@@ -529,24 +527,12 @@ def test_settings_of_a_given_search_hold_and_none_is_given_twice() -> None:
         method_with(RULED, ep.FreeRunScore(n_folds=3), 1)
 
 
-def test_evidence_is_refused_for_fronts_of_rows() -> None:
+def test_what_cannot_be_estimated_is_refused() -> None:
     run = ep.lotka_volterra().trajectory(noise=0.05, rng=0)
-    with pytest.raises(ValueError, match="Evidence weighs what a search of trajectories found"):
-        ep.discover(
-            run, method=ep.Regression(search=ep.BestSubset(), selection=ep.discovery.Evidence())
-        )
-
-
-def test_what_cannot_be_estimated_is_refused_with_the_way_out() -> None:
-    run = ep.lotka_volterra().trajectory(noise=0.05, rng=0)
-    with pytest.raises(ValueError, match=r"the library needs \['z'\].*\+exp=trace"):
+    with pytest.raises(ValueError, match=r"the library needs \['z'\]"):
         ep.estimate([run], ep.polynomial(["x", "y", "z"], degree=1))
-    with pytest.raises(ValueError, match="limit_s must be positive"):
-        ep.estimate([run], ep.polynomial(["x", "y"], degree=2), limit_s=-1.0)
     with pytest.raises(ValueError, match="needs more samples than terms, got 6"):
         ep.estimate([run.window(0, 6)], ep.polynomial(["x", "y"], degree=2))
-    with pytest.raises(ValueError, match="a run must have five samples or more: .* has 2"):
-        ep.estimate([run, run.window(0, 2)], ep.polynomial(["x", "y"], degree=2))
 
 
 def test_a_library_without_the_constant_where_a_state_drifts_is_a_lack_of_fit() -> None:
@@ -619,21 +605,6 @@ def test_runs_are_joined_without_a_way_from_one_to_the_next(
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9 * np.abs(other).max())
 
 
-def test_a_pass_over_many_runs_is_a_single_call(
-    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    fit = three_runs(rng)
-    calls: list[int] = []
-
-    def tell(flow: np.ndarray, *rest: np.ndarray) -> tuple:
-        calls.append(len(flow))
-        return marginalise(flow, *rest)
-
-    monkeypatch.setattr(likelihood, "marginalise", tell)
-    gram(fit)
-    assert calls == [len(fit.path) - 1]
-
-
 def test_more_coefficients_than_memory_holds_are_refused_first(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -648,21 +619,16 @@ def test_more_coefficients_than_memory_holds_are_refused_first(
     cost.check_size([run], library, run_of_known_terms)
 
 
-def test_a_long_search_is_stated_of_with_its_time() -> None:
+def test_a_long_search_is_warned_of_unless_a_limit_ends_it_sooner() -> None:
     run, t = many_states(7), np.linspace(0.0, 900.0, 90_000)
     long = ep.Trajectory(t, np.tile(np.sin(t)[:, None], 7), run.state_names)
     large = ep.polynomial(run.state_names, degree=3)
-    stated = r"840 coefficients .*, of which 140 .* some 2 minutes of one core and 2.6 GB"
-    with pytest.warns(ep.discovery.SlowSearch, match=stated):
+    with pytest.warns(ep.discovery.SlowSearch, match="some 2 minutes of one core"):
         cost.check_size([long], large, {})
-    with pytest.warns(ep.discovery.SlowSearch, match="of which 840 .* some 60 minutes"):
-        cost.check_size([long], large, {}, coupled=True)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         cost.check_size([run], large, {})
         cost.check_size([long], large, {}, limit_s=200.0)
-    with pytest.warns(ep.discovery.SlowSearch, match="limit_s ends it"):
-        cost.check_size([long], large, {}, limit_s=20.0)
 
 
 class Clock:

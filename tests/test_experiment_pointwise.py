@@ -2,7 +2,6 @@ import os
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 import xarray as xr
 from omegaconf import DictConfig, OmegaConf
@@ -16,8 +15,6 @@ from ep2sindy.studies.resume import pieces_key
 from tests import programs
 from tests.programs import summary_of
 from tests.test_resume import broken_and_resumed
-
-ROOT = Path(__file__).resolve().parents[1]
 
 
 def composed(*overrides: str) -> DictConfig:
@@ -74,14 +71,9 @@ def test_the_file_holds_every_map(toy_run: Path) -> None:
         assert ((result["confidence"] >= 0) & (result["confidence"] <= 1)).all()
 
 
-def test_tables_figures_and_page_are_there(toy_run: Path) -> None:
+def test_points_and_figures_go_to_tensorboard(toy_run: Path) -> None:
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-    terms = pd.read_csv(toy_run / "tables" / "terms.csv")
-    assert len(terms) == 2 * len(TERMS)
-    assert terms["selected"].between(0, 1).all()
-    for name in ("coefficients", "regimes", "quality"):
-        assert (toy_run / "figures" / f"{name}.png").stat().st_size > 5e3
     events = EventAccumulator(str(toy_run / "tensorboard")).Reload()
     assert [e.value for e in events.Scalars("points/done")][-1] == 30.0
     assert {"coefficients", "regimes", "quality"} <= set(events.Tags()["images"])
@@ -94,9 +86,6 @@ def test_a_line_of_points_without_an_optional_variable(grid: Path, tmp_path: Pat
     overrides = ["data.r.name=null", "data.variables.u_ir.name=null"]
     found = programs.computed(composed(*on_file(line, tmp_path), *overrides))
     assert found.summary["n_points"] == 6
-    log = " ".join(found.log.split())
-    assert "lacks their variables: n_i*u_ir" in log
-    assert "(all 6 points)" in log
     found.check_figures("regimes")
     with xr.open_dataset(found.folder / "pointwise.nc") as result:
         assert list(result["term"].values) == [name for name in TERMS if "u_ir" not in name]

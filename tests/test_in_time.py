@@ -7,7 +7,7 @@ import pytest
 import xarray as xr
 
 import ep2sindy as ep
-from ep2sindy.data.gaps import describe_breaks, present_rows
+from ep2sindy.data.gaps import describe_breaks
 
 T = np.sort(np.random.default_rng(2).uniform(0.0, 1.0, 400))
 T[[0, -1]] = 0.0, 1.0
@@ -129,12 +129,6 @@ def test_steps_say_what_they_cannot_do(step: object, settings: dict, message: st
         step(plane(T), **settings)
 
 
-def test_a_step_takes_a_field_and_no_trajectory() -> None:
-    run = ep.lotka_volterra().trajectory()
-    with pytest.raises(ValueError, match=r"must be an xarray\.Dataset, .*, got Trajectory"):
-        ep.data.crop(run, start_s=5.0)
-
-
 def test_steps_that_need_every_sample_name_a_gap() -> None:
     for step, settings in (
         (ep.data.resample, {"dt_s": 0.5}),
@@ -160,13 +154,6 @@ def test_a_state_without_a_number_is_named() -> None:
     field["x"].values[:] = np.nan
     with pytest.raises(ValueError, match="x must hold numbers: all its 11 samples are NaN"):
         ep.zone_average(field, None, states=["x", "y"])
-
-
-def test_samples_that_no_row_holds_together_are_named() -> None:
-    t = np.arange(6.0)
-    x, y = np.where(t < 3, t, np.nan), np.where(t >= 2, t, np.nan)
-    with pytest.raises(ValueError, match="of 6 samples x lacks 3, y lacks 2, and 1 are left"):
-        present_rows({"x": x, "y": y})
 
 
 def test_gaps_in_the_times_themselves_are_counted() -> None:
