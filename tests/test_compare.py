@@ -66,22 +66,6 @@ def test_two_runs_are_set_side_by_side(
         assert row in rows
 
 
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("nowhere", "a run is a folder: .*nowhere is not there"),
-        ("early", "early has no summary.json: it ended early"),
-    ],
-)
-def test_what_is_no_run_is_named_with_the_way_out(
-    name: str, message: str, runs: tuple[Path, Path], tmp_path: Path
-) -> None:
-    (tmp_path / "early").mkdir()
-    (tmp_path / "early" / "run.log").write_text("")
-    with pytest.raises(ValueError, match=message):
-        compare([str(runs[0]), str(tmp_path / name)])
-
-
 def test_the_jobs_of_a_sweep_are_compared_but_for_those_that_failed(
     runs: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

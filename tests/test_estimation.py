@@ -31,7 +31,7 @@ from ep2sindy.estimation.likelihood import (
 from ep2sindy.estimation.noise import _shown_by_samples
 from ep2sindy.estimation.observation import LackOfFit, Solution
 from ep2sindy.estimation.problem import EstimationProblem, scale_problem
-from ep2sindy.estimation.solver import EXACT, from_smooth, smooth_states
+from ep2sindy.estimation.solver import EXACT, from_smooth
 from ep2sindy.estimation.supports import alternatives, best_support, penalise, term_penalties
 from ep2sindy.trust import memory
 from ep2sindy.trust.interruption import is_interruption
@@ -469,20 +469,6 @@ def test_a_switched_input_is_exact_and_its_multiples_are_no_terms() -> None:
     assert np.abs(found.model.coef).max() < 3.0
 
 
-def test_a_joint_discovery_has_fronts_scores_and_a_model() -> None:
-    system = ep.lorenz()
-    found = ep.discover(system.trajectory(noise=0.2, rng=0))
-    assert is_right(found.model, system)
-    assert found.estimate is not None
-    for state, front in found.fronts.items():
-        assert front.candidates[0].n_terms == 0
-        assert front.candidates[int(np.argmin(found.scores[state]))].terms == tuple(
-            found.chosen[state].terms
-        )
-        assert found.chosen[state].coef_by_term == found.model.terms(state)
-    assert found.note in repr(found)
-
-
 def test_the_search_is_the_same_in_other_units() -> None:
     system = ep.lotka_volterra()
     run = system.trajectory(noise=0.1, rng=0)
@@ -660,36 +646,6 @@ def test_a_search_ends_at_its_limit_with_the_best_so_far(
     else:
         assert not found.lack_of_fit
         assert set(found.model.terms("x")) == {"x", "y"}
-
-
-def test_the_time_is_looked_at_within_a_step_of_a_fit() -> None:
-    """A step makes many passes over the samples, each of which may be long."""
-    now, steps = 0, 0
-
-    def clock() -> float:
-        return float(now)
-
-    def advance(n_more: int) -> None:
-        nonlocal steps
-        steps += n_more
-
-    run = ep.lorenz().trajectory(noise=0.05, rng=0).window(0, 100)
-    monitor = cost.SearchMonitor(limit_s=1.0, clock=clock, advance=advance)
-    problem = scale_problem([run], ep.polynomial(run.state_names, degree=2), monitor=monitor)
-    noise = np.full(run.states.shape, 0.1)
-    free, support = np.zeros(problem.n_free), np.ones(problem.n_free, dtype=bool)
-    fit = TrajectoryFit(problem, noise, 0.1, problem.records[0].samples, free, support)
-    now, monitor.best = 2, fit
-    for one_pass in (
-        lambda: fit.squares,
-        lambda: gram(fit),
-        lambda: smooth_states(problem, None),
-    ):
-        with pytest.raises(cost.OutOfTimeError, match="must end within limit_s=1 s"):
-            one_pass()
-    assert steps == 0
-    monitor.best = None  # a first model is waited for
-    assert np.isfinite(fit.squares).all()
 
 
 @pytest.mark.parametrize(

@@ -2,15 +2,12 @@
 
 import re
 from dataclasses import replace
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 
 from benchmarks.known_systems import noisy
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.forecasting import evaluation
 from ep2sindy.forecasting.evaluation import evaluate
 from ep2sindy.library.library import polynomial
 from ep2sindy.model.comparison import FreeRunBounds, Status
@@ -212,30 +209,6 @@ def test_a_run_without_a_cycle_has_none_of_its_numbers() -> None:
         assert [rest.growth_per_s > 0.0 for rest in found.rest_points] == [found is diverges]
     assert np.isnan(diverges.phase_end)
     assert re.fullmatch(r"diverges after [0-9.]+ s", diverges.text)
-
-
-def test_only_what_is_asked_for_is_computed_and_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    calls: list[str] = []
-    for name in ("limit_cycle", "basin_stability", "rest_point", "forecast_skill"):
-        plain = getattr(evaluation, name)
-
-        def stated(*args: Any, name: str = name, plain: Any = plain, **kwargs: Any) -> Any:
-            calls.append(name)
-            skill = SimpleNamespace(text=f"fitted to {kwargs.get('n_fitted')}")
-            return skill if name == "forecast_skill" else plain(*args, **kwargs)
-
-        monkeypatch.setattr(evaluation, name, stated)
-    found = evaluate(hopf(growth=0.05), record(), n_fitted=1000)
-    assert (found.status, found.record.n_samples) == (Status.SUSTAINED, 1002)
-    assert found.periods == pytest.approx(20.0, abs=0.1)
-    assert not calls
-    assert found.multiplier < 1.0
-    assert calls == ["limit_cycle"]
-    assert "fitted to 1000" in repr(found)
-    n_calls = len(calls)
-    assert repr(found)
-    assert len(calls) == n_calls
-    assert calls.count("forecast_skill") == calls.count("limit_cycle") == 1
 
 
 def test_of_a_line_of_rest_points_one_is_stated() -> None:

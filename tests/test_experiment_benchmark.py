@@ -1,4 +1,3 @@
-import sys
 from pathlib import Path
 
 import pandas as pd
@@ -78,17 +77,3 @@ def test_every_definition_makes_a_variant() -> None:
     for name, definition in composed("definitions=pysindy").definitions.items():
         if name.startswith("PySINDy"):
             assert isinstance(instantiate(definition), Variant)
-
-
-@pytest.fixture
-def no_pysindy(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "pysindy", None)
-    monkeypatch.delitem(sys.modules, "benchmarks.pysindy_variants", raising=False)
-
-
-@pytest.mark.usefixtures("no_pysindy")
-def test_a_rival_without_pysindy_is_refused(tmp_path: Path) -> None:
-    config = composed(*toy(tmp_path), "definitions=pysindy", "variants=[ours,PySINDy_SSR]")
-    message = r"PySINDy is not there: pip install \"ep2sindy\[benchmark\]\""
-    with pytest.raises(ValueError, match=message):
-        run_config(config)

@@ -243,22 +243,6 @@ def test_what_enters_is_net_where_nothing_leaves(outflow, inflow, is_net: bool) 
 BOXES = ep.Weak(test_functions=ep.regression.Boxes(n_windows=7), errors_in_variables=False)
 
 
-def test_fits_are_named_by_what_varies() -> None:
-    fits = {
-        "plain": Fit(),
-        "lengths": Fit(form="boxes", n_points=[5, 9]),
-        "both": Fit(form="boxes", n_points=[5], n_windows=[7, 8]),
-    }
-    ways = {way.name: way for way in expand(fits, {"boxes": BOXES}, ep.Differential())}
-    assert list(ways) == [
-        "plain", "n_points_5", "n_points_9", "n_windows_7_n_points_5", "n_windows_8_n_points_5",
-    ]  # fmt: skip
-    assert ways["n_windows_8_n_points_5"].form.test_functions == ep.regression.Boxes(
-        n_windows=8, n_points=5
-    )
-    assert [way.of for way in ways.values()] == ["plain", *["lengths"] * 2, *["both"] * 2]
-
-
 @pytest.mark.parametrize(
     ("fit", "message"),
     [

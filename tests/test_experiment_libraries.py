@@ -3,9 +3,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hydra import compose, initialize_config_dir
 
-import ep2sindy as ep
 from ep2sindy.app.runner import run_config
 from ep2sindy.app.schema import study_of
 from ep2sindy.discovery.discover import discover
@@ -108,20 +106,6 @@ def test_a_run_folder_holds_all_that_it_takes_to_look_again(breathing_run: Path)
     assert model.terms("n_i") == summary_of(folder)["models"]["simple"]["equations"]["n_i"]
 
 
-def test_a_record_too_short_for_forecasts_is_searched_without(tmp_path: Path) -> None:
-    t = np.arange(21.0)
-    run = ep.Trajectory(t, np.column_stack([np.cos(0.5 * t), np.sin(0.5 * t)]), ["x", "y"])
-    run.to_dataframe().to_csv(tmp_path / "run.csv")
-    found = computed(
-        composed(
-            "+exp=discover", "data=recognised", f"data.path={tmp_path / 'run.csv'}",
-            "trajectory.states=[x,y]", "libraries.model.degree=1", f"output={tmp_path}",
-        )
-    )  # fmt: skip
-    assert set(found.report.models["model"].terms("x")) == {"y"}
-    assert "forecasts" not in found.summary
-
-
 @pytest.fixture(scope="module")
 def years(tmp_path_factory: pytest.TempPathFactory) -> Computed:
     """Predator and prey over thirty years, counted three times a year with 2 % of noise."""
@@ -207,18 +191,6 @@ def test_an_error_is_kept_in_the_log(predator_prey: Path, tmp_path: Path) -> Non
         run_config(config)
     (folder,) = (tmp_path / "breathing").iterdir()
     assert "ended early: ValueError: n_culled must leave" in (folder / "run.log").read_text()
-
-
-def test_a_sweep_can_go_to_slurm() -> None:
-    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        config = compose(
-            "config",
-            overrides=["+exp=parametric", "hydra/launcher=slurm"],
-            return_hydra_config=True,
-        )
-    launcher = config.hydra.launcher
-    assert launcher._target_.endswith("SlurmLauncher")
-    assert (launcher.cpus_per_task, launcher.tasks_per_node) == (8, 1)
 
 
 def test_a_state_that_shows_nothing_but_noise_has_no_law(tmp_path: Path) -> None:

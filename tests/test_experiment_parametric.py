@@ -4,7 +4,6 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-import xarray as xr
 from omegaconf import DictConfig
 
 from ep2sindy.app.runner import run_config
@@ -168,11 +167,3 @@ def test_nothing_that_oscillates_is_a_result(tmp_path: Path) -> None:
     folder = run_config(composed(*own_files(tmp_path, still), "trajectory.zone=null"))
     assert not (folder / "figures").exists()
     assert summary_of(folder)["points"][0]["status"] == "steady"
-
-
-def test_a_variable_that_a_point_lacks_is_named(tmp_path: Path) -> None:
-    whole = breathing_file(tmp_path / "a.nc", amplitude=0.5, dt_s=1.5e-6)
-    with xr.open_dataset(whole, decode_times=False) as field:
-        write_field(field.load().drop_vars("u_iz"), tmp_path / "b.nc")
-    with pytest.raises(ValueError, match=r"operating point V_D_V=300, mdot_mg_s=5: .*'u_iz'"):
-        programs.computed(composed(*own_files(tmp_path, whole, tmp_path / "b.nc")))

@@ -121,23 +121,6 @@ def test_own_code_that_has_changed_has_other_blocks(place: str, grid: Path, here
     assert len(set(keys)) == 4
 
 
-def test_a_study_that_selects_nothing_is_a_result(tmp_path: Path) -> None:
-    rng = np.random.default_rng(0)
-    time_s, z = 1.5e-6 * np.arange(400), np.array([0.01, 0.02, 0.03])
-    noise = {
-        name: (("time", "z"), 1.0 + 0.1 * rng.standard_normal((400, 3)), {"units": unit})
-        for name, unit in (("n_i", "m^-3"), ("n_n", "m^-3"), ("u_iz", "m/s"), ("R_ion", "m^3/s"))
-    }
-    path = tmp_path / "noise.nc"
-    write_field(xr.Dataset(noise, coords={"time": time_s, "z": z}), path)
-    overrides = [*on_file(path, tmp_path), "data.r.name=null", "data.variables.u_ir.name=null"]
-    found = programs.computed(composed(*overrides, "terms=[n_i*u_iz]", "selection=ebic"))
-    assert found.summary["n_valid"] == 3
-    assert found.summary["equations"] == [{"n_i": {}, "n_n": {}}]
-    assert set(found.report.figures) == {"regimes", "quality"}
-    found.check_figures("regimes", "quality")
-
-
 def test_other_settings_have_other_blocks(grid: Path, tmp_path: Path) -> None:
     def key(*overrides: str) -> str:
         return key_of(*on_file(grid, tmp_path), *overrides)

@@ -104,9 +104,6 @@ def test_fields_over_r_are_averaged_by_area(field: xr.Dataset) -> None:
     both.attrs = field.attrs
     expected = (0.04 + 2.0 * 0.05) / 0.09 * field["n_i"].values
     np.testing.assert_allclose(breathing.along_z(both["n_i"]), expected, rtol=1e-5)
-    window = slice(0, 100)
-    for figure in (breathing.profile_figure(both), breathing.space_time_figure(both, window)):
-        assert all(ax.has_data() for ax in figure.axes)
     assert breathing.profile_table(both)["n_i_mean"].to_numpy() == pytest.approx(
         expected.mean(axis=0), rel=1e-5
     )

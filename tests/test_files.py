@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
 from ep2sindy.report.folder import RunFolder
 from ep2sindy.runtime.files import WriteError, fingerprint, replacing, write_json, write_text
@@ -95,18 +94,6 @@ def test_json_has_null_for_what_is_not_a_number(tmp_path: Path) -> None:
     write_json(tmp_path / "a.json", {"a": [1.0, float("nan")], "b": {"c": float("inf")}})
     content = json.loads((tmp_path / "a.json").read_text())
     assert content == {"a": [1.0, None], "b": {"c": None}}
-
-
-def test_figures_are_written_in_the_formats_that_are_asked_for(tmp_path: Path) -> None:
-    folder = RunFolder.create(tmp_path, "x", now=NOW)
-    figure = Figure()
-    figure.subplots().plot(np.arange(3))
-    png = folder.write_figure("line", figure, ["pdf", "png"])
-    assert png.startswith(b"\x89PNG")
-    assert (folder.path / "figures" / "line.png").read_bytes() == png
-    assert (folder.path / "figures" / "line.pdf").read_bytes().startswith(b"%PDF")
-    folder.write_figure("alone", figure, ["png"])
-    assert not (folder.path / "figures" / "alone.pdf").exists()
 
 
 def test_provenance_names_commit_and_versions(tmp_path: Path) -> None:

@@ -228,10 +228,6 @@ def test_a_simulation_shows_what_the_coefficients_leave_open() -> None:
     expected = 2.0 * 1.96 * 0.5 * 0.01 * t[zero]
     assert (high - low)[zero, 0] == pytest.approx(expected, rel=0.05)
     np.testing.assert_array_equal(run.states, model.simulate(t, [1.0, 0.0]).states)
-    with pytest.raises(ValueError, match="draws need the covariance of the coefficients"):
-        SPRING.simulate(t, [1.0, 0.0], draws=10)
-    with pytest.raises(ValueError, match="a band needs draws"):
-        SPRING.simulate(t, [1.0, 0.0]).band()
 
 
 def test_a_run_that_diverges_is_not_a_number_and_counts_as_such() -> None:

@@ -173,15 +173,3 @@ def test_arrays_lack_samples_as_tables_do() -> None:
         pytest.raises(ValueError, match=r"an input needs a value at every sample: \['x0'\] lack"),
     ):
         trajectories_of(table, inputs=["x0"], partial=True)
-
-
-@pytest.mark.parametrize(
-    ("runs", "t", "message"),
-    [
-        (pd.DataFrame(SAMPLES), TIMES[:5], r"a time for each of \d+ rows, got \(5,\)"),
-        (PREY, TIMES, "t is for arrays and tables without times, got a Trajectory"),
-    ],
-)
-def test_times_that_cannot_be_are_refused(runs: object, t: object, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        trajectories_of(runs, t=t)

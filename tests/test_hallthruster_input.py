@@ -30,11 +30,6 @@ TUTORIAL = {
         "grid": {"type": "EvenGrid", "num_cells": 100},
     },
 }  # fmt: skip
-# the keys of v0.18, whose config holds the propellant itself
-OLD = {
-    "propellant": "Krypton", "anode_mass_flow_rate": 4e-6, "neutral_velocity": 278.0, "ncharge": 2,
-    "ion_temperature_K": 800.0,
-}  # fmt: skip
 
 
 @pytest.fixture
@@ -90,16 +85,6 @@ def test_a_field_within_the_file_needs_no_other(tmp_path: Path) -> None:
     content = changed(thruster=THRUSTER | {"magnetic_field": within})
     field = read(tmp_path, content).thruster.magnetic_field
     np.testing.assert_allclose(field.at(np.zeros(1)), 0.01)
-
-
-def test_the_keys_of_older_versions(folder: Path) -> None:
-    content = changed(**OLD)
-    del content["config"]["propellants"]
-    made = read(folder, content)
-    assert made.thruster.propellant.name == "krypton"
-    assert made.thruster.charge_states == 2
-    assert made.thruster.ion_temperature == 800.0
-    assert made.operating_point == ep.thruster.OperatingPoint(300.0, 4.0, 278.0)
 
 
 def test_a_temperature_alone_gives_the_neutrals_a_quarter_of_their_thermal_speed(
@@ -183,12 +168,6 @@ def test_ingestion_takes_the_number_in_Torr_for_one_in_Pa(folder: Path) -> None:
     assert still.background is None
 
 
-def test_what_stands_next_to_a_list_of_propellants_is_not_read(folder: Path) -> None:
-    """HallThruster.jl runs such files at 150 m/s: u of the neutrals in ref_spt100_baseline."""
-    beside = {"neutral_velocity": 278.0, "neutral_temperature_K": 300.0, "ion_temperature_K": 1.0}
-    assert read(folder, changed(**beside)) == read(folder, TUTORIAL)
-
-
 @pytest.mark.parametrize("corrected", [True, False])
 def test_a_plume_that_is_solved_is_thermal(folder: Path, corrected: bool) -> None:
     content = changed(solve_plume=True, apply_thrust_divergence_correction=corrected)
@@ -208,16 +187,6 @@ def test_a_plume_that_is_solved_is_thermal(folder: Path, corrected: bool) -> Non
 def test_what_is_not_here_is_refused_by_name(folder: Path, config: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         read(folder, changed(**config))
-
-
-@pytest.mark.parametrize(
-    ("content", "message"), [("{", r"must be JSON"), ("[]", r"must have the key 'config'")]
-)
-def test_a_file_that_is_no_input_is_refused(tmp_path: Path, content: str, message: str) -> None:
-    path = tmp_path / "input.json"
-    path.write_text(content)
-    with pytest.raises(ValueError, match=message):
-        read_hallthruster_input(path)
 
 
 def test_a_file_is_simulated_as_it_says(folder: Path) -> None:
