@@ -162,8 +162,3 @@ def test_a_wider_library_holds_the_same_model() -> None:
         assert wider.model.terms(state) == system.model.terms(state)
     with pytest.raises(ValueError, match=r"terms of Lorenz, of degree 2 or more, got degree=1"):
         realization("lorenz", 0.0, 0, degree=1)
-
-
-def test_systems_that_there_are_not() -> None:
-    with pytest.raises(ValueError, match=r"unknown systems \['Lorentz'\]; there are"):
-        outcomes_of(systems=["lorenz", "Lorentz"], variants={"STLSQ": STLSQ_})

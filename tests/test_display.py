@@ -4,16 +4,8 @@ import numpy as np
 import pytest
 
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.library.library import Library, named_terms, polynomial
-from ep2sindy.model.model import SparseModel, coef_matrix
-
-UNITS = {"n_i": "m^-3", "n_n": "m^-3"}
-
-
-def breathing() -> SparseModel:
-    library = named_terms(["n_i", "n_n"], ["1", "n_i", "n_i*n_n"])
-    equations = [{"n_i": -2.62e5, "n_i*n_n": 5.481e-14}, {"1": 1.83e23}]
-    return SparseModel(library, ["n_i", "n_n"], coef_matrix(library, equations), UNITS)
+from ep2sindy.library.library import Library, polynomial
+from ep2sindy.model.model import SparseModel
 
 
 def crowded(n_states: int) -> SparseModel:
@@ -22,14 +14,6 @@ def crowded(n_states: int) -> SparseModel:
     library = polynomial(names[:4], degree=4)
     coef = np.random.default_rng(0).normal(size=(len(library), n_states))
     return SparseModel(library, names, coef)
-
-
-def test_a_model_prints_its_equations_with_units() -> None:
-    assert str(breathing()) == (
-        "n_i' = -2.62e+05 n_i + 5.48e-14 n_i n_n [m^-3 s^-1]\n"
-        "n_n' = 1.83e+23 [m^-3 s^-1]\n"
-        "n_i in m^-3, n_n in m^-3, t in s"
-    )
 
 
 @pytest.mark.parametrize("n_states", [1, 3, 24, 40])

@@ -6,7 +6,6 @@ import re
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +15,6 @@ import ep2sindy as ep
 from benchmarks.estimation import LORENZ, SHORT
 from benchmarks.known_systems import noisy
 from ep2sindy.data.sensor import Bounds
-from ep2sindy.discovery.method import method_of
 from ep2sindy.estimation import cost, explanation, kernels, likelihood
 from ep2sindy.estimation.kernels import filter_states, marginalise, smooth_corrections
 from ep2sindy.estimation.likelihood import (
@@ -478,39 +476,6 @@ def test_the_search_is_the_same_in_other_units() -> None:
     size = np.array([1e18, 1e19])
     factor = 1e6 * size / system.model.library.evaluate(size)[:, None]
     np.testing.assert_allclose(other.coef, one.coef * factor, rtol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"selection": ep.EBIC()}, "selection must be Evidence"),
-        ({"limit_s": 0.0}, "limit_s must be positive, in s, or None"),
-    ],
-)
-def test_settings_that_do_not_go_with_trajectories_are_refused(
-    settings: dict[str, Any], message: str
-) -> None:
-    with pytest.raises(ValueError, match=message):
-        ep.TrajectorySearch(**settings)
-
-
-RULE = ep.FreeRunScore(n_folds=2)
-RULED = ep.TrajectorySearch(selection=RULE, depth=2)
-
-
-def method_with(search: ep.TrajectorySearch, selection: object, depth: int) -> object:
-    return method_of(ep.WeightedWeak(), search, ep.Bootstraps(n=0), selection, depth)
-
-
-def test_settings_of_a_given_search_hold_and_none_is_given_twice() -> None:
-    deep = ep.TrajectorySearch(depth=3)
-    assert method_with(deep, ep.discovery.Evidence(), 1) == deep
-    assert method_with(ep.TrajectorySearch(), RULE, 2) == RULED
-    assert method_with(RULED, ep.discovery.Evidence(), 2) == RULED
-    with pytest.raises(ValueError, match=r"must be set once, got .*search.depth\), and 2 next to"):
-        method_with(deep, ep.discovery.Evidence(), 2)
-    with pytest.raises(ValueError, match="search.selection.*; leave one of them out"):
-        method_with(RULED, ep.FreeRunScore(n_folds=3), 1)
 
 
 def test_what_cannot_be_estimated_is_refused() -> None:

@@ -11,7 +11,6 @@ import ep2sindy as ep
 from ep2sindy.data.open import write_field
 from ep2sindy.library.library import polynomial
 from ep2sindy.model.model import SparseModel, model_of
-from ep2sindy.studies.fitted import Fit, expand
 from ep2sindy.studies.processes import Zones, compared_processes
 from ep2sindy.studies.structures import Structure, balance_model
 from tests import programs
@@ -177,12 +176,6 @@ def test_the_laws_own_structure_is_sustained_at_both_points(tmp_path: Path) -> N
     found.check_figures("sustained")
 
 
-def test_a_balance_fit_needs_a_simulation(predator_prey: Path, tmp_path: Path) -> None:
-    toy = [*ils(predator_prey, tmp_path), "+fits.balance.form=balance"]
-    with pytest.raises(ValueError, match="coefficients of the balance need processes"):
-        programs.computed(programs.composed(*toy))
-
-
 def made_record() -> tuple[ep.Trajectory, Zones]:
     """A record whose processes are exactly those of terms."""
     time = 1.5e-6 * np.arange(2000)
@@ -238,24 +231,3 @@ def test_what_enters_is_net_where_nothing_leaves(outflow, inflow, is_net: bool) 
     balance = zones.balances[""]
     left = balance["exit_n"].values if is_net else 0.0
     np.testing.assert_array_equal(entering.recorded, balance["supply"].values - left)
-
-
-BOXES = ep.Weak(test_functions=ep.regression.Boxes(n_windows=7), errors_in_variables=False)
-
-
-@pytest.mark.parametrize(
-    ("fit", "message"),
-    [
-        (Fit(form="boxs"), r"fits.a.form must be null, balance or one of \['boxes'\]: got 'boxs'"),
-        (Fit(n_points=[5]), r"are for a form of random windows \(Weak with Boxes\): got Diff"),
-    ],
-)
-def test_a_fit_that_cannot_be_made_is_refused(fit: Fit, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        expand({"a": fit}, {"boxes": BOXES}, ep.Differential())
-
-
-def test_a_structure_is_of_one_kind() -> None:
-    for given in ({}, {"terms": {"x": ["x"]}, "coefficients": {"x": {"x": 1.0}}}):
-        with pytest.raises(ValueError, match="by terms, by roles or by coefficients, one of them"):
-            Structure(**given)

@@ -135,12 +135,6 @@ def test_a_scan_ends_where_its_runs_cannot_be_kept(tmp_path: Path) -> None:
         run_config(config)
 
 
-def test_a_scan_where_nothing_can_be_run_is_an_error(tmp_path: Path) -> None:
-    config = composed(*toy(tmp_path), "scan={operating_point.voltage:[-5.0,-6.0]}")
-    with pytest.raises(ValueError, match="a scan needs a point that can be run: .*got -5"):
-        run_config(config)
-
-
 def test_a_place_that_the_config_leaves_to_its_default_can_be_scanned() -> None:
     data = Configured(plain(composed().data), "data")
     points = scan_points(data, {"thruster.transport.c_plume": [0.01, 0.02], "cfl": [0.5]})
@@ -160,12 +154,6 @@ def test_kernels_are_compiled_without_a_trace(tmp_path: Path) -> None:
     )
     compile_kernels([point.data for point in points])
     assert not (tmp_path / "cache").exists()
-
-
-def test_data_that_are_no_simulation_are_refused(predator_prey: Path, tmp_path: Path) -> None:
-    on_file = ["data=file", f"data.path={predator_prey}", f"output={tmp_path}"]
-    with pytest.raises(ValueError, match="data must be a simulation, .*open_field gave none; choo"):
-        run_config(composed(*on_file))
 
 
 def test_a_run_that_breaks_at_once_is_reported(tmp_path: Path) -> None:
