@@ -287,7 +287,7 @@ def test_the_experiment_reports_zones_and_their_processes(tmp_path: Path) -> Non
     record = chain()
     found = computed(composed(*toy(tmp_path)))
     assert found.summary["data"]["variables"] == NAMES
-    sustained = found.summary["models"]["zones_living"]["equations"]
+    sustained = found.summary["models"]["zones_sustained"]["equations"]
     taken = sustained["n_i@a"]["n_i@a"]
     assert sustained["n_i@b"]["n_i@a"] == pytest.approx(-taken / 2, rel=1e-6)
     assert sustained["n_n@a"]["1"] == pytest.approx(1.2e24, rel=0.01)  # free in a file
