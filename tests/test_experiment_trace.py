@@ -81,25 +81,17 @@ def test_one_column_of_a_file_becomes_a_sustained_model(record: Path, tmp_path: 
     assert (folder / "figures" / "free_run_trace.png").exists()
 
 
-@pytest.mark.parametrize("how", ["derivative", "delays"])
-def test_a_signal_of_either_sign_can_be_taken(how: str, tmp_path: Path) -> None:
+def test_a_signal_of_either_sign_can_be_taken(tmp_path: Path) -> None:
     t = 0.12 * np.arange(850)  # 16 periods
     run = ep.systems.van_der_pol(mu=0.5).model.simulate(t, [2.0, 0.0])
     path = scope(tmp_path / "scope.csv", run.t, run.states[:, 0])
-    settings = {
-        "derivative": toy(path, tmp_path, "search.max_terms=3", "tried=[{how: derivative}]"),
-        "delays": glance(path, tmp_path, "tried=[{how: delays, degree: 1}]"),
-    }
-    found = computed(composed(*settings[how]))
+    given = toy(path, tmp_path, "search.max_terms=3", "tried=[{how: derivative}]")
+    found = computed(composed(*given))
     assert found.summary["signal"]["reason"] == "set"
-    if how == "derivative":
-        equations = found.summary["models"]["trace"]["equations"]
-        assert equations["I"] == {"v": 1.0}
-        assert set(equations["v"]) == {"I", "v", "I^2*v"}
-        assert found.summary["evaluations"]["trace"]["status"] == "sustained"
-    else:
-        assert found.summary["signal"]["known"] == {}
-        assert "I_before" in found.log
+    equations = found.summary["models"]["trace"]["equations"]
+    assert equations["I"] == {"v": 1.0}
+    assert set(equations["v"]) == {"I", "v", "I^2*v"}
+    assert found.summary["evaluations"]["trace"]["status"] == "sustained"
 
 
 def test_a_signal_that_does_not_repeat_itself_is_tried_in_three_states(tmp_path: Path) -> None:
