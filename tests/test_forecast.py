@@ -1,5 +1,6 @@
 """Forecasts: starts from the past alone, bands that hold what they say, and baselines."""
 
+import sys
 from dataclasses import replace
 from functools import cache
 
@@ -33,6 +34,12 @@ def spring(noise: float, *, momentum_gain: float = 0.0, n: int = 1200, seed: int
     return Trajectory(h * np.arange(n), samples, ("x", "v"))
 
 
+@pytest.fixture
+def few_starts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Bands are calibrated by few forecasts, for tests that look at none."""
+    monkeypatch.setattr(sys.modules[calibrate.__module__], "N_STARTS", 10)
+
+
 @pytest.mark.parametrize(("noise", "momentum_gain"), [(0.1, 0.0), (0.05, 0.02)])
 def test_noise_and_pushes_are_those_of_the_record(noise, momentum_gain) -> None:
     estimator = tune_estimator(SPRING, spring(noise, momentum_gain=momentum_gain, n=3000))
@@ -60,6 +67,7 @@ def test_a_start_is_the_kalman_filter_of_the_window() -> None:
     assert np.sqrt(np.diag(end.covariance)) == pytest.approx(expected, rel=0.1)
 
 
+@pytest.mark.usefixtures("few_starts")
 def test_nothing_but_the_past_enters() -> None:
     run = LORENZ.trajectory(noise=0.05, rng=0).window(0, 900)
     changed = run.states.copy()
@@ -251,6 +259,7 @@ def test_a_gap_is_no_obstacle() -> None:
     assert 0.8 <= skill.coverage_90 <= 1.0
 
 
+@pytest.mark.usefixtures("few_starts")
 @pytest.mark.parametrize(
     ("call", "message"),
     [
@@ -267,6 +276,7 @@ def test_what_cannot_be_forecast_is_refused(call, message) -> None:
         call()
 
 
+@pytest.mark.usefixtures("few_starts")
 def test_a_model_that_runs_away_forecasts_without_breaking() -> None:
     wild = replace(LORENZ.model, coef=1e6 * LORENZ.model.coef)
     run = LORENZ.trajectory(noise=0.05, rng=0).window(0, 300)
@@ -291,6 +301,7 @@ def test_rounded_samples_are_compared_as_they_are() -> None:
     assert np.mean(skill.nrmse["model"]) < 0.1
 
 
+@pytest.mark.usefixtures("few_starts")
 def test_a_history_whose_end_is_at_rest_is_forecast() -> None:
     t = np.arange(0.0, 60.0, 0.05)
     states = np.stack([np.exp(-t) * np.cos(t), -np.exp(-t) * (np.cos(t) + np.sin(t))], axis=1)
@@ -301,6 +312,7 @@ def test_a_history_whose_end_is_at_rest_is_forecast() -> None:
     assert np.abs(ahead.states).max() < 1e-2
 
 
+@pytest.mark.usefixtures("few_starts")
 def test_the_noise_of_three_samples_is_not_stated() -> None:
     few = spring(0.05).window(0, 3)
     with pytest.raises(
