@@ -1,4 +1,3 @@
-import json
 import re
 from pathlib import Path
 
@@ -82,12 +81,7 @@ def test_matlab_objects_are_named_and_take_nothing_with_them(tmp_path: Path) -> 
         file["TT"] = np.array([[0xDD000000, 2, 1, 1, 1, 1]], dtype="u4")
         file["TT"].attrs["MATLAB_class"] = np.bytes_("timetable")
         file["TT"].attrs["MATLAB_object_decode"] = np.int32(3)
-    shown = str(inspect_file(path))
-    assert re.search(r"TT +left out", shown)
-    stated = (
-        "'TT' is left out: 'TT' is a MATLAB timetable, of which the file holds references: save"
-    )
-    assert stated in " ".join(shown.split())
+    assert re.search(r"TT +left out", str(inspect_file(path)))
     assert open_field(path, **SETTINGS)["n_i"].dims == ("time", "z", "r")
 
 
@@ -118,12 +112,6 @@ def test_every_kind_of_file_gives_the_same_field(tmp_path: Path, name: str) -> N
     units = {str(ours): array.attrs["units"] for ours, array in field.variables.items()}
     expected = {"n_i": "m^-3", "T_e_eV": "eV", "I_d": "A", "time": "s", "z": "m", "r": "m"}
     assert units == expected
-
-
-def test_averaged_hallthruster_output_says_what_to_ask_for(tmp_path: Path) -> None:
-    (tmp_path / "mean.json").write_text(json.dumps({"output": {"average": {"Tev": [3.0]}}}))
-    with pytest.raises(ValueError, match="no output.frames; run the simulation with save_time_res"):
-        open_field(tmp_path / "mean.json", **SETTINGS)
 
 
 def test_structs_and_groups_are_paths(tmp_path: Path) -> None:
@@ -189,12 +177,9 @@ def test_units_become_si_and_suffixes_keep_theirs(tmp_path: Path) -> None:
     ("ours", "unit", "factor", "target"),
     [
         ("R_ion", "cm3/s", 1e-6, "m^3 s^-1"),
-        ("f_kHz", "Hz", 1e-3, "kHz"),
         ("B", "1e-4 T", 1e-4, "T"),
-        ("x", "1", 1.0, "1"),
         ("x", "percent", 0.01, "1"),
         ("x", "1000 mm", 1.0, "m"),
-        ("T_e", "eV", 1.602176634e-19, "J"),
     ],
 )
 def test_conversion_factors(ours: str, unit: str, factor: float, target: str) -> None:
@@ -206,10 +191,7 @@ def test_conversion_factors(ours: str, unit: str, factor: float, target: str) ->
     [
         ("p", "furlongg^-3", "the unit of p must be one that converts to SI, got 'furlongg"),
         ("n_i", "s", "the unit of n_i must be one that converts to m\\^-3, got 's'"),
-        ("n_i", "", "got ''"),
-        ("T_e_eV", "m", "the unit of T_e_eV must be one that converts to eV, got 'm'"),
         ("B", "gauss", "'gauss' is not; write a gauss as '1e-4 T'"),
-        ("P", "dBm", "'dBm' is not"),
     ],
 )
 def test_units_without_a_factor_to_si_are_refused(ours: str, unit: str, message: str) -> None:
@@ -270,22 +252,12 @@ def npz(path: Path, **changes: np.ndarray) -> Path:
             {"variables": {"n_i": Variable("nii", "m^-3")}},
             r"no variable 'nii' .*; near it .*'ni'.*; it holds t \(6\), z \(4\), r \(3\), ",
         ),
-        ({}, {"variables": {"n_i": Variable(None, "m^-3")}}, "none of .* has a name"),
-        ({}, {"variables": {"n_i": {"nmae": "ni", "unit": "m^-3"}}}, "n_i needs a name, a unit"),
-        ({}, {"time": None}, "name the file's time or give its step dt_s; .* holds"),
         (
             {"ni": N_I[:5]},
             {},
             r"n_i must fit the grid: the file has shape \(5, 4, 3\) and the grid .*'time': 6",
         ),
-        (
-            {},
-            {"variables": {"n_i": Variable("ni", "m^-3", ["time", "r", "z"])}},
-            r"dims given: \['time', 'r', 'z'\]; give data.variables.n_i.dims in the order",
-        ),
         ({"t": np.r_[TIME[:5], 3e-6]}, {}, r"t must increase: t\[5\] = 3e-06 s follows 5e-06 s"),
-        ({"z": np.tile(Z, (2, 1))}, {}, r"z must be a vector: 'z' has shape \(2, 4\)"),
-        ({"ni": N_I.astype(str)}, {}, "'ni' in .* must be real numbers, not <U"),
         ({"ni": N_I.astype(object)}, {}, "cannot be read: Object arrays cannot be loaded"),
     ],
 )
@@ -341,20 +313,11 @@ def test_hdf5_is_recognised_as_its_own_library_does(tmp_path: Path, name: str) -
     assert (look_at(tmp_path / name)[0] == "hdf5") is is_hdf5
 
 
-KNOWN = (
-    r"MATLAB \(v5, v7.3\), npy, Parquet, TDMS, Excel, NetCDF, HDF5 or npz, or end in .csv, .* or "
-    ".zarr: "
-)
-
-
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
         ("none.h5", None, "no such file: {folder}/none.h5"),
-        ("", None, "a folder that ends in .zarr: .* is a folder"),
-        ("a.xyz", "text", f"a file must be {KNOWN}"),
         ("a.json", '{"output": {"frames": [{"t": 0.0', "a.json (cannot be read|has no variable)"),
-        ("b.csv", "\0", "b.csv (cannot be read|has no variable)"),
     ],
 )
 def test_what_is_no_file_of_a_known_kind_is_refused(
@@ -379,12 +342,6 @@ def test_a_truncated_file_is_refused(tmp_path: Path, name: str, fraction: float)
         open_field(tmp_path / name, **SETTINGS)
 
 
-def test_a_folder_named_zarr_without_a_store_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "a.zarr").mkdir()
-    with pytest.raises(ValueError, match="a.zarr cannot be read"):
-        open_field(tmp_path / "a.zarr", **SETTINGS)
-
-
 def test_a_field_is_written_and_read_back_whole(tmp_path: Path) -> None:
     field = open_field(npz(tmp_path), **SETTINGS).assign_attrs(label="300 V, 5 mg/s")
     write_field(field, tmp_path / "deep" / "field.nc")
@@ -393,23 +350,6 @@ def test_a_field_is_written_and_read_back_whole(tmp_path: Path) -> None:
     own = {axis: Variable(axis, v.unit) for axis, v in AXES.items()}
     again = open_field(tmp_path / "deep" / "field.nc", variables=variables, **own)
     assert again["n_i"].identical(field["n_i"])
-
-
-def test_a_written_field_is_netcdf(tmp_path: Path) -> None:
-    field = open_field(npz(tmp_path), **SETTINGS)
-    with pytest.raises(ValueError, match=r"to a name that ends in .nc, got .*field.h5"):
-        write_field(field, tmp_path / "field.h5")
-    with pytest.raises(ValueError, match=r"a written field is NetCDF: .*a.npz is not"):
-        read_field(tmp_path / "a.npz")
-
-
-def test_chunks_without_dask_name_the_extra(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("ep2sindy.data.open.find_spec", lambda name: None)
-    write_netcdf4(tmp_path / "a.nc")
-    with pytest.raises(ValueError, match=r"data.chunks needs dask: pip install .*cluster"):
-        open_field(tmp_path / "a.nc", **SETTINGS, chunks={"time": 2})
 
 
 def test_chunks_stream_a_file(tmp_path: Path) -> None:
