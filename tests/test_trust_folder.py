@@ -23,10 +23,8 @@ CSV = (
     "+data.variables.y.name=y", "+data.variables.y.unit=1", "trajectory.states=[x,y]",
 )  # fmt: skip
 RUNS: dict[str, Sequence[str]] = {
-    "help": ("--help",),
     "inspect": ("inspect", "run.h5"),
     "discover": CSV,
-    "sweep": ("-m", *CSV, "seed=1,2"),
     "workers": (
         "+exp=benchmark", "systems=[oscillator]", "noises=[0]", "variants=[STLSQ]",
         "n_realizations=2", "parallel=loky",
@@ -34,7 +32,7 @@ RUNS: dict[str, Sequence[str]] = {
     "compare": ("compare", "run.h5"),
     "theirs": ("+exp=theirs",),
 }  # fmt: skip
-FAST = ("help", "inspect", "theirs")
+FAST = ("inspect", "theirs")
 REFUSED = ("compare", "theirs")
 CALL = "{{_target_: os.system, command: 'echo called >> {ran}'}}"
 CONFIGS = {
