@@ -128,8 +128,3 @@ def test_a_law_of_two_parameters_is_drawn_as_a_map_and_of_three_not_at_all() -> 
     assert grid.get_array().size == 4
     with pytest.raises(ValueError, match="one or two parameters: this law has"):
         ep.plot(law(["w", "b", "c"], [[3.0, 0.0, 0.0]]), [point(3.0, 0.0, 0.0)])
-
-
-def test_what_cannot_be_drawn_says_what_can() -> None:
-    with pytest.raises(TypeError, match=r"plot draws a Discovery, Evaluation, .*, got list"):
-        ep.plot([1.0])
