@@ -10,10 +10,7 @@ from ep2sindy.app.arguments import mend, options_first
 from ep2sindy.app.runner import study_class
 from ep2sindy.app.schema import bind, plain, study_of
 from ep2sindy.data.fields import check_field
-from tests import programs
 from tests.programs import composed, ended
-
-ROOT = Path(__file__).resolve().parents[1]
 
 
 @pytest.mark.parametrize(
@@ -21,29 +18,8 @@ ROOT = Path(__file__).resolve().parents[1]
     [
         (["+exp=breathin"], "there is no experiment 'breathin'; near it is +exp=breathing; there"),
         (["+ex=breathing"], "an experiment is chosen with +exp=breathing, got '+ex=breathing'"),
-        (["exp=breathing"], "'exp=breathing' adds to the config, which needs a plus: write +exp="),
-        (["breathing"], "must be KEY=VALUE, such as +exp=discover or seed=1, got 'breathing'; +e"),
         (["inspct", "run.csv"], "got 'inspct'; near it is the command inspect, which stands fi"),
-        (["+exp=discover", "data=recogn"], "near it is data=recognised; there are file, recog"),
-        (["+exp=discover", "serch=joint"], "unknown key 'serch'; near it is search; there are"),
-        (
-            ["+exp=discover", "search.alphaa=3"],
-            "unknown key 'search.alphaa'; near it are search.",
-        ),
-        (["+exp=discover", "max_terms=3"], "unknown key 'max_terms'; near it is search.max_terms"),
-        (["+exp=breathing", "seed.x=3"], "unknown key 'seed.x': seed is 0, and has no keys"),
-        (["+exp=discover", "data=file", "data.variables.x.name=x"], "a new one, where any may"),
-        (
-            ["+exp=discover", "search=best_subset", "bootstraps=none", "bootstraps.block=3"],
-            "'bootstraps.block' is left to its default here: a plus sets it, +bootstraps.block=VAL",
-        ),
-        (
-            ["+exp=breathing", "prepare={a: b}"],
-            "Cannot merge DictConfig with ListConfig; --cfg",
-        ),
         (["+exp=discover", "exclude={x: [x^2]}"], "must stand in double quotes inside single ones"),
-        (["+exp=discover", "--confg", "job"], "unknown option '--confg'; near it are --cfg, --con"),
-        (["+exp=discover", "serch=joint", "sede=1"], "unknown key 'serch'; --cfg job shows those"),
     ],
 )
 def test_a_misspelt_name_ends_in_our_words_with_the_nearest(
@@ -113,12 +89,3 @@ def test_a_step_that_a_config_names_is_composed_and_called(name: str) -> None:
     if name == "ionization_rate":
         field = field.drop_vars("R_ion", errors="ignore")
     check_field(step(field))
-
-
-def test_a_step_that_is_misspelt_names_the_nearest() -> None:
-    config = composed("+exp=breathing", "prepare=[{_target_: ep2sindy.data.crp, start_s: 0}]")
-    with pytest.raises(ValueError, match=r"near it: ep2sindy\.data\.crop"):
-        programs.computed(config)
-    config = composed("+exp=breathing", "prepare=[{_target_: ep2sindy.data.crop, strt_s: 0}]")
-    with pytest.raises(ValueError, match="near it are start_s, stop_s; it takes"):
-        study_of(study_class(config.study), config)

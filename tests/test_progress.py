@@ -1,8 +1,6 @@
 """Stages of long work: who is informed, how bars look, and that results do not change."""
 
 import inspect
-import io
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -15,7 +13,6 @@ from ep2sindy._stubs import dotted_names
 from ep2sindy.runtime.progress import SILENT, Bars, Stated, as_progress, count_pieces
 
 LIBRARY = ep.polynomial(["x", "y"], degree=2)
-BRIEF = {"duration_s": 3e-5, "warm_up_s": 3e-6}
 
 
 @dataclass
@@ -61,18 +58,6 @@ def regression(selection: object = None, **settings: object) -> ep.Regression:
     )
 
 
-def test_a_regression_tells_its_stages_in_order(prey: ep.Trajectory) -> None:
-    watch = Recorder()
-    ep.discover(prey, LIBRARY, regression(), progress=watch)
-    assert [each.label for each in watch.stages] == [
-        "rows of the regression", "draws of rows", "search for x'", "search for y'",
-        "candidates by EBIC",
-    ]  # fmt: skip
-    assert [each.total for each in watch.stages if each.unit == "draw"] == [4, 4]
-    assert all(each.over for each in watch.stages)
-    assert all(each.done == each.total for each in watch.stages if each.total is not None)
-
-
 def test_a_result_does_not_depend_on_who_watches(prey: ep.Trajectory) -> None:
     watched, alone = (
         ep.discover(prey, LIBRARY, regression(), seed=1, **more)  # type: ignore[arg-type]
@@ -108,30 +93,6 @@ def test_whoever_is_not_asked_is_silent(prey: ep.Trajectory, capfd: pytest.Captu
     assert {"discover", "estimate", "refine", "pointwise"} <= set(asking)
     ep.discover(prey, LIBRARY, regression())
     assert capfd.readouterr() == ("", "")
-
-
-def test_logs_and_pipes_see_no_bars(prey: ep.Trajectory, capfd: pytest.CaptureFixture) -> None:
-    ep.discover(prey, LIBRARY, regression(), progress=True)
-    assert capfd.readouterr() == ("", "")
-
-
-class Terminal(io.StringIO):
-    def isatty(self) -> bool:
-        return True
-
-
-def test_a_terminal_sees_label_count_and_unit_and_then_nothing(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    terminal = Terminal()
-    monkeypatch.setattr(sys, "stderr", terminal)
-    with Bars().stage(3, "system", "refined") as advance:
-        first = terminal.getvalue()
-        assert "refined:   0%" in first
-        assert "0/3 system [" in first
-        advance(3)
-    assert terminal.getvalue().endswith("\r")
-    assert not terminal.getvalue().split("\r")[-2].strip()
 
 
 def test_true_means_bars_and_a_function_is_stated() -> None:

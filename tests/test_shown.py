@@ -31,12 +31,6 @@ def test_what_is_found_in_a_record_over_years_is_shown_per_year() -> None:
             ep.SparseModel.from_json(text.replace('"seconds": 31557600.0', wrong))
 
 
-def test_notes_are_read_to_their_end() -> None:
-    text = repr(ep.discover(ep.data.hare_lynx()))
-    assert "or take a smaller library" in text
-    assert max(map(len, text.splitlines())) <= 100
-
-
 def test_models_take_tables_and_states_by_name() -> None:
     run = ep.lotka_volterra().trajectory()
     model = ep.lotka_volterra().model
