@@ -282,9 +282,7 @@ def test_second_call_reads_identical_values(tmp_path):
     ("settings", "message"),
     [
         ({"n_z": 5}, r"n_z must be 10 or more .* got 5"),
-        ({"duration_s": 1e-9}, r"duration_s must hold at least 16 sampling steps"),
         ({"thruster": Thruster(inner_radius=0.003)}, r"the plume must end before the axis"),
-        ({"thruster": Thruster(pressure_factor=1.5)}, r"pressure_factor must be 1, got 1\.5"),
     ],
 )
 def test_bad_settings_say_what_must_hold(settings, message):

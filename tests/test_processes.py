@@ -122,24 +122,3 @@ def test_a_small_zone_gives_a_large_one_less() -> None:
             for term, value in group.terms.items():
                 total[term] = total.get(term, 0.0) + group.sign * value
         assert total == pytest.approx({t: v for t, v in given[state].items() if v})
-
-
-def test_a_discovery_under_roles_is_printed_by_process() -> None:
-    rng = np.random.default_rng(0)
-    library = ep.polynomial(["x", "y"], degree=2)
-    coef = ep.model.coef_matrix(
-        library, [{"1": 1.0, "x": -0.5, "x*y": -1.0}, {"x*y": 1.0, "y": -0.6}]
-    )
-    truth = ep.SparseModel(library, ["x", "y"], coef, {"x": "1", "y": "1"})
-    t = np.linspace(0.0, 20.0, 801)
-    run = ep.Trajectory(t, truth.simulate(t, [1.5, 0.3]).states, ["x", "y"])
-    run = replace(run, states=run.states + 1e-6 * rng.normal(size=run.states.shape))
-    roles = ep.Roles(exchange=[("x", "y")], outflow=["x", "y"], inflow={"x": 1.0}, nonnegative=True)
-    method = ep.Regression(
-        search=ep.BestSubset(max_terms=3, n_best=60),
-        selection=ep.FreeRunScore(bounds=None),
-        depth=6,
-    )
-    found = ep.discover(run, library.with_roles(roles), method)
-    assert re.search(r"x' = 1 - 1 \(.*\) x y - 0\.5 \(.*\) x \[", repr(found))
-    assert "<i>x</i>" in found._repr_html_()

@@ -121,18 +121,6 @@ def test_the_least_aicc_is_chosen() -> None:
     assert least_aicc([(("x",), 0.01)], 20) == frozenset()
 
 
-def test_a_user_who_chooses_by_aicc_selects() -> None:
-    system = lotka_volterra()
-    run, rng = system.trajectory(), np.random.default_rng(0)
-    truth = {state: frozenset(system.model.terms(state)) for state in system.model.states}
-    chosen = PySINDyVariant(PySINDyStlsq(), aicc=True).find([run], system.model.library, rng=rng)
-    assert chosen.selected is not None
-    assert all(truth[state] <= chosen.selected[state] for state in truth)
-    assert (
-        PySINDyVariant(PySINDyStlsq()).find([run], system.model.library, rng=rng).selected is None
-    )
-
-
 def test_pysindy_as_it_comes_is_its_own_default() -> None:
     pysindy = pytest.importorskip("pysindy")
     system = lotka_volterra()

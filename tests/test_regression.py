@@ -82,14 +82,6 @@ def test_columns_at_the_edge_of_the_number_format_keep_finite_norms() -> None:
     assert problem.theta_scale[0] == pytest.approx(np.sqrt(6.0) * 1e200)
 
 
-def test_a_library_larger_than_the_rows_is_refused() -> None:
-    run = cubic(np.linspace(0, 1, 12), "short")
-    with pytest.raises(ValueError, match=r"library of 16 terms needs .* 9 of 12 rows"):
-        ep.Differential().assemble(
-            [run], ep.polynomial(["x"], degree=15), rng=np.random.default_rng(0)
-        )
-
-
 def test_an_overflowing_term_is_named() -> None:
     t = np.linspace(0, 1, 40)
     run = ep.Trajectory(t=t, states=1e120 * (1 + t)[:, None], state_names=["n"])
@@ -153,15 +145,6 @@ def test_of_dependent_terms_the_simplest_are_kept() -> None:
         "'x*u^2' is a multiple of 'x*u' on every row and is left out",
         "c^2 is a linear combination of s^2, 1 on every row and is left out",
     ]
-
-
-def test_the_user_is_stated_what_cannot_be_stated_apart() -> None:
-    messages = [a.message for a in ambiguities(degenerate())]
-    assert "'zero' is zero on every row and is left out" in messages
-    assert "'minus_3a' is a multiple of 'a' on every row and is left out" in messages
-    combination = "a_plus_2b is a linear combination of a, b on every row"
-    assert f"{combination} and is left out" in messages
-    assert any("'a' and 'nearly_a' are nearly proportional" in m for m in messages)
 
 
 def test_a_combination_of_many_terms_is_named_and_stays_in_the_search() -> None:

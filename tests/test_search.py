@@ -204,19 +204,11 @@ def test_shares_count_bootstraps() -> None:
     assert pooled.inclusion[2, 2:].max() < 0.5
 
 
-def test_culling_everything_is_refused() -> None:
-    with pytest.raises(ValueError, match="must leave a term: 6 of 6 would go"):
-        Bootstraps(n_culled=6).draw(
-            noisy_problem(np.ones(6)), np.ones(6, dtype=bool), np.random.default_rng(0)
-        )
-
-
 @pytest.mark.parametrize(
     ("build", "message"),
     [
         (lambda: AdaptiveLasso(gamma=0.0), "gamma must be positive"),
         (lambda: STLSQ(lowest=1.0, highest=0.5), "0 < lowest < highest"),
-        (lambda: Bootstraps(smallest=0.0), "0 < smallest <= largest"),
     ],
 )
 def test_impossible_settings_are_refused(build: object, message: str) -> None:

@@ -267,14 +267,3 @@ def test_a_refinement_that_ends_worse_than_it_began_is_not_kept() -> None:
     np.testing.assert_array_equal(
         spoilt, measure.assess([trial, trial], same, batch, fold, SILENT)[1]
     )
-
-
-def test_what_cannot_be_assessed_is_refused() -> None:
-    run = PREY.trajectory()
-    choices = {s: [PREY.model.terms(s)] for s in PREY.model.states}
-    fronts = fronts_of([run], PREY.model.library, choices)
-    with pytest.raises(ValueError, match=r"every state needs one front, got \['x'\]"):
-        scores_by(RULE, fronts[:1])
-    short = fronts_of([run.window(0, 9)], PREY.model.library, choices)
-    with pytest.raises(ValueError, match="5 samples or more, got at most 9; use longer records"):
-        scores_by(RULE, short)
