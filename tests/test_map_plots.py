@@ -100,14 +100,6 @@ def test_a_coefficient_below_the_scale_is_not_drawn_as_absent(sign: float) -> No
     assert not np.allclose(mesh.to_rgba(least), to_rgba(ABSENT), atol=0.01)
 
 
-def test_masked_cells_are_blank_and_absent_terms_are_not(coefficients: Figure) -> None:
-    for _, values in maps(coefficients):
-        assert np.ma.getmaskarray(values)[:, -1].all()
-        assert not np.ma.getmaskarray(values)[:, :-1].any()
-    absent = maps(coefficients)[0][1]
-    assert (absent.compressed() == 0.0).all()
-
-
 def test_coefficients_fade_to_grey_with_r2_and_the_share_of_bootstraps(
     coefficients: Figure,
 ) -> None:
@@ -124,13 +116,6 @@ def test_coefficients_fade_to_grey_with_r2_and_the_share_of_bootstraps(
         assert to_rgba(ax.get_facecolor()) == to_rgba(ABSENT)
         assert np.allclose(mesh.cmap(np.nan), to_rgba("white"))
     assert HALF in legend(coefficients)
-
-
-def test_coefficients_of_no_term_at_all_are_refused() -> None:
-    result = study()
-    result["coef"] *= 0.0
-    with pytest.raises(ValueError, match="no point of the study selected any"):
-        coefficient_maps(result)
 
 
 def test_r2_below_zero_is_drawn_as_zero(quality: Figure) -> None:

@@ -92,17 +92,9 @@ def test_masks_that_mean_nothing_are_refused(missing: np.ndarray, message: str) 
         ep.Trajectory(np.arange(5.0), states, ["x", "y"], missing=missing)
 
 
-def test_a_regression_needs_two_complete_samples() -> None:
-    missing = np.array([[True, False], [False, True]] * 4)
-    run = ep.Trajectory(np.arange(8.0), np.arange(16.0).reshape(8, 2) ** 1.5, ["x", "y"],
-                        missing=missing)  # fmt: skip
-    with pytest.raises(ValueError, match="x lacks 4, y lacks 4, and 0 of 8 hold all"):
-        ep.discover(run, ep.polynomial(["x", "y"], degree=1), ep.Regression())
-
-
 def test_an_equation_that_is_closed_holds_next_to_one_that_is_not() -> None:
     """Lorenz without z: x' = 10 (y - x) needs no z, and y' does."""
-    run = LORENZ.trajectory(noise=0.05, rng=0).window(0, 1500)
+    run = LORENZ.trajectory(noise=0.05, rng=0).window(0, 900)
     two = ep.Trajectory(run.t, run.states[:, :2], ["x", "y"])
     found = ep.estimate(two, ep.polynomial(["x", "y"], degree=2))
     assert found.explained_states == ("x",)

@@ -14,9 +14,7 @@ from ep2sindy.figures.operating import (
     FADED,
     WRONG,
     cycle_figure,
-    frequency_scale,
     laws_figure,
-    left_out_figure,
 )
 from ep2sindy.library.library import named_terms, polynomial
 from ep2sindy.operating.law import OperatingLaw
@@ -54,25 +52,6 @@ def spots(ax: Axes) -> dict[tuple[float, ...], tuple[str, str]]:
         )
         for edge in marks.get_edgecolor()[:1]
     }
-
-
-def left_out(scale: float, states: Sequence[str]) -> pd.DataFrame:
-    f = scale * np.array([10.0, 11.0, 12.0])
-    shapes = {}
-    for state in states:
-        shapes[f"amplitude_ratio_{state}"] = [1.0, 1.1, 9.0]
-        shapes[f"waveform_error_{state}"] = [0.1, 0.2, 3.0]
-    known = {"enclosed": [False, True, False], "f_kHz": f, "f_error": 0.01}
-    return pd.DataFrame({"branch": "all", **known, **shapes})
-
-
-@pytest.mark.parametrize(("scale", "unit"), [(1.0, "kHz"), (1e-5, "mHz"), (1e5, "GHz")])
-def test_points_left_out_are_drawn_at_any_frequency(scale: float, unit: str) -> None:
-    figure = left_out_figure(left_out(scale, ["x"]))
-    assert "enclosed by the others" in drawn(figure)
-    left = figure.axes[0]
-    assert frequency_scale(left_out(scale, ["x"])["f_kHz"])[1] == unit
-    assert 1.0 <= left.get_xlim()[1] < 2e3
 
 
 def grid(n: int) -> pd.DataFrame:
@@ -114,18 +93,6 @@ def test_a_map_is_faded_beyond_the_fitted_points_and_white_without_a_cycle() -> 
     np.testing.assert_array_equal(opacity, np.where(rows["inside"], 1.0, FADED))
     shown = np.ma.masked_invalid(map_.get_array()).T.ravel()
     np.testing.assert_array_equal(shown.mask, rows["status"] == "decays")
-
-
-def test_one_parameter_has_a_line_that_ends_with_the_cycle() -> None:
-    rows = grid(11)
-    rows = rows[rows["b"] == 0.0].assign(inside=rows["a"] < 1.45)
-    figure = cycles(rows, "a")
-    whole, inside = figure.axes[0].lines
-    np.testing.assert_array_equal(whole.get_ydata(), rows["f_kHz"])
-    assert (whole.get_alpha(), inside.get_alpha()) == (FADED, None)
-    np.testing.assert_array_equal(inside.get_ydata(), rows["f_kHz"].where(rows["a"] < 1.45))
-    assert spots(figure.axes[1])[2.0, 0.0][0] == "#222222"  # no amplitude, and a law at rest
-    assert spots(figure.axes[0])[2.0, 11.0][1] == WRONG  # a record where the law is at rest
 
 
 def example_law(n: int, parameters: Sequence[str]) -> tuple[OperatingLaw, pd.DataFrame]:

@@ -43,7 +43,7 @@ def test_two_commands_lead_from_a_file_to_its_equations(
     stated = capsys.readouterr().out
     command = "ep2sindy +exp=discover data=scope 'trajectory.states=[x,y,z]'"
     assert command in stated
-    rest = ["trajectory.states=[x,y,z]", "search=best_subset", "selection=ebic"]
+    rest = ["trajectory.states=[x,y,z]", "search=best_subset", "selection=ebic", "forecasts=0"]
     assert not ended("+exp=discover", "data=scope", *rest)
     (run,) = (folder / "outputs" / "discover").iterdir()
     summary = json.loads((run / "summary.json").read_text())
@@ -80,7 +80,7 @@ def test_several_files_are_several_records(folder: Path) -> None:
         lorenz_csv(folder / f"run{k}.csv", seed=k)
     overrides = [
         "+exp=discover", "data=recognised", "trajectory.states=[x,y,z]", f"output={folder}",
-        "search=best_subset", "selection=ebic",
+        "search=best_subset", "selection=ebic", "forecasts=0",
     ]  # fmt: skip
     found = computed(composed(*overrides, "data.path=run*.csv"))
     assert all(f"data: run{k}.csv; 1000 samples" in found.log for k in range(2))
@@ -97,7 +97,7 @@ def test_a_gap_leaves_the_step_as_it_is(folder: Path, capsys: pytest.CaptureFixt
     step = ep.inspect_file("whole.csv").held[0].step
     found = computed(composed(
         "+exp=discover", "data=recognised", "data.path=a.csv", "trajectory.states=[x,y,z]",
-        "search=best_subset", "selection=ebic", f"output={folder}",
+        "search=best_subset", "selection=ebic", "forecasts=0", f"output={folder}",
     ))  # fmt: skip
     assert list(found.summary["evaluations"]) == ["model"]
     assert f"500 samples of {SECONDS.duration_text(step, digits=4)} from" in found.log

@@ -161,12 +161,6 @@ def test_masked_inputs_mask_the_point() -> None:
     assert (status.isel(z=slice(1, None)) == 0).all()
 
 
-def test_a_setting_that_fits_nowhere_is_an_error() -> None:
-    short = parabolas().isel(time=slice(0, 8))
-    with pytest.raises(ValueError, match="could be fitted: smoothing needs at least 11"):
-        ep.pointwise(short, searching(), workers=Serial())
-
-
 def test_units_of_coefficients_follow_the_field(exact: xr.Dataset) -> None:
     assert exact["coef_units"].sel(equation="x", term="u").item() == "m^-4"
     assert exact["coef_units"].sel(equation="x", term="x").item() == "s^-1"

@@ -1,6 +1,5 @@
 """Stages of long work: who is informed, how bars look, and that results do not change."""
 
-import inspect
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -9,8 +8,7 @@ import numpy as np
 import pytest
 
 import ep2sindy as ep
-from ep2sindy._stubs import dotted_names
-from ep2sindy.runtime.progress import SILENT, Bars, Stated, as_progress, count_pieces
+from ep2sindy.runtime.progress import count_pieces
 
 LIBRARY = ep.polynomial(["x", "y"], degree=2)
 
@@ -77,31 +75,3 @@ def test_what_fails_leaves_its_stage() -> None:
         break
     pieces.close()
     assert [(each.done, each.over) for each in watch.stages] == [(0, True), (0, True)]
-
-
-def test_whoever_is_not_asked_is_silent(prey: ep.Trajectory, capfd: pytest.CaptureFixture) -> None:
-    """Whatever can tell its progress does so on request; simulators ask for themselves."""
-    asking = {
-        entry.name: parameter.default
-        for entry in dotted_names().values()
-        if inspect.isfunction(value := entry.load())
-        and (parameter := inspect.signature(value).parameters.get("progress"))
-    }
-    simulators = {name for name, default in asking.items() if default is True}
-    assert simulators == {"simulate", "simulate_2d"}
-    assert {asking[name] for name in set(asking) - simulators} == {False}
-    assert {"discover", "estimate", "refine", "pointwise"} <= set(asking)
-    ep.discover(prey, LIBRARY, regression())
-    assert capfd.readouterr() == ("", "")
-
-
-def test_true_means_bars_and_a_function_is_stated() -> None:
-    assert as_progress(True) == Bars()
-    assert as_progress(False) is SILENT
-    watch, numbers = Recorder(), []
-    assert as_progress(watch) is watch
-    stated = as_progress(numbers.append)
-    assert isinstance(stated, Stated)
-    with stated.stage(2, "point") as advance:
-        advance(2)
-    assert numbers == [2]

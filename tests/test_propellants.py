@@ -8,7 +8,6 @@ from ep2sindy.thruster.closures import FURTHER, TABLE_STEP_EV, TRANSITIONS, clos
 from ep2sindy.thruster.constants import ATOMIC_MASS, E_CHARGE, M_ELECTRON
 from ep2sindy.thruster.propellants import (
     FURTHER_IONIZATIONS,
-    PropellantTable,
     XenonFits,
     ionization_rate,
     thermal_speed,
@@ -172,14 +171,6 @@ def test_a_table_that_cannot_be_taken_says_why(tmp_path, text, change, message):
     path.write_text(text)
     with pytest.raises(ValueError, match=message):
         ep.thruster.read_propellant(path, **(OWN | change))
-
-
-def test_rates_must_cover_the_ends_of_the_discharge():
-    short = PropellantTable(
-        "own", 2e-25, 12.0, 8.0, (4.0, 60.0), (0.0, 1e-13), (0.0,) * 2, (0.0,) * 2
-    )
-    with pytest.raises(ValueError, match=r"rates of own cover T_e from 4 to 60 eV, and it is 3 eV"):
-        ep.thruster.Thruster(propellant=short)
 
 
 def test_a_charge_needs_its_rates():

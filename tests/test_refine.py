@@ -315,8 +315,6 @@ def test_start_that_blows_up_is_a_result() -> None:
     found = ep.refine(model, [clean(PREY)], window=50, n_windows=3, seed=rng)
     assert found.status == "non_finite"
     assert found.loss == np.inf
-    assert "window 0 (from sample " in found.message
-    assert found.message.endswith("follows no finite trajectory beyond sample 1")
     np.testing.assert_array_equal(found.model.coef, model.coef)
 
 
@@ -385,7 +383,9 @@ def stiff(k_dt: float) -> tuple[ep.SparseModel, ep.Trajectory]:
     return model, ep.Trajectory(t, solution.y.T, ["x", "y", "z"])
 
 
-@pytest.mark.parametrize("noise", [0.0, pytest.param(0.01, marks=pytest.mark.slow), 0.05])
+@pytest.mark.parametrize(
+    "noise", [*(pytest.param(n, marks=pytest.mark.slow) for n in (0.0, 0.01)), 0.05]
+)
 @pytest.mark.parametrize("k_dt", [0.5, 2.0, 5.0, 20.0])
 @pytest.mark.parametrize("step", [RungeKutta(), RungeKutta(32)])
 def test_stiff_model_is_right_or_says_that_it_is_not(

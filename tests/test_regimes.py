@@ -195,14 +195,6 @@ def test_axes_may_come_in_any_order() -> None:
     assert found_in(turned).labels.equals(found_in(patched()).labels)
 
 
-def test_regimes_tell_whether_they_are_as_many_as_allowed() -> None:
-    limits = {
-        n: find_regimes(patched(), rng=np.random.default_rng(0), max_regimes=n).at_limit
-        for n in (1, 2, 3)
-    }
-    assert limits == {1: True, 2: True, 3: False}
-
-
 def test_the_table_counts_the_points_that_are_unsure() -> None:
     draws = np.array(patched()["weight_draws"].values)
     draws[:, 0, 1, 3, 2] = 1.0  # all say source, where the whole says sink

@@ -15,7 +15,6 @@ from ep2sindy.app.runner import start_run
 from ep2sindy.report.document import Result, Table, Text
 from ep2sindy.report.report import Report
 from ep2sindy.report.results import Metric, ResultTable, View
-from ep2sindy.report.tensorboard import Board
 from tests.programs import summary_of
 
 ROWS = pd.DataFrame({"n_terms": [1, 2], "r2": [0.5, float("nan")], "text": ["a < b", "[c]"]})
@@ -106,28 +105,3 @@ def test_two_of_one_name_are_an_error(
             with pytest.raises(ValueError, match="got 'a' twice"):
                 report.table("a", SIZES)
             assert report.tables["a"] is ROWS
-
-
-def test_tensorboard_reads_what_a_run_tells_it(tmp_path: Path) -> None:
-    png = tmp_path / "figure.png"
-    line().savefig(png, dpi=100)
-    board = Board(tmp_path / "run" / "tensorboard")
-    board.scalars({"loss": 0.5}, step=1)
-    board.scalars({"loss": 0.25}, step=2)
-    board.image("front", png.read_bytes())
-    board.equations({"one": "x' = y\ny' = -x", "two": "x' = 1"})
-    board.settings({"seed": 3, "search": "BestSubset"}, {"r2": 0.75})
-    board.close()
-    events = EventAccumulator(str(tmp_path / "run" / "tensorboard")).Reload()
-    assert [(e.step, e.value) for e in events.Scalars("loss")] == [(1, 0.5), (2, 0.25)]
-    assert events.Scalars("r2")[0].value == 0.75
-    (image,) = events.Images("front")
-    assert (image.width, image.height) == (300, 200)
-    assert image.encoded_image_string == png.read_bytes()
-    (text,) = events.Tensors("equations")
-    lines = text.tensor_proto.string_val[0].decode().splitlines()
-    assert [line[:4].strip() for line in lines] == [""] * 6  # one block of code
-    assert "      y' = -x" in lines
-    plugins = events.PluginTagToContent("hparams")
-    assert set(plugins) == {"_hparams_/session_start_info"}
-    assert b"BestSubset" in plugins["_hparams_/session_start_info"]

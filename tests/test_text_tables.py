@@ -222,9 +222,6 @@ def test_a_first_column_of_another_name_is_no_time_unless_the_user_says_so(tmp_p
     (tmp_path / "a.csv").write_text("frame,x\n" + rows(np.arange(30.0), X))
     (note,) = ep.inspect_file(tmp_path / "a.csv").notes()
     assert note == "a field needs time: give the step between samples, data.dt_s=STEP in s"
-    (tmp_path / "b.csv").write_text("when,x\n" + rows(0.5 * np.arange(30.0), X))
-    (note,) = ep.inspect_file(tmp_path / "b.csv").notes()
-    assert note.endswith("or, if 'when' is time, 'data.time={name:when,unit:UNIT}'")
 
 
 def test_a_preamble_next_to_the_rows_says_units(tmp_path: Path) -> None:

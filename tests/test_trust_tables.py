@@ -1,8 +1,6 @@
 """Tables, packed arrays and JSON of other people: read as what they are, or refused by name."""
 
-import io
 import json
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,7 +11,6 @@ import xarray as xr
 
 import ep2sindy as ep
 from ep2sindy.data.readers.registry import open_source
-from ep2sindy.data.readers.source import leaves
 from ep2sindy.library.library import named_terms
 
 X = np.arange(20) * 250.5  # below a thousand, and above
@@ -105,19 +102,6 @@ def test_columns_of_one_name_are_numbered_and_none_is_taken_for_the_name(tmp_pat
     assert [each.name for each in found.held] == ["t", "x.0", "x.1"]
     with pytest.raises(ValueError, match=r"no variable 'x' .*it holds t \(9\), x\.0 \(9\), x\.1"):
         ep.open_field(tmp_path / "a.csv", variables={"x": ep.data.Variable("x", "1")}, dt_s=1.0)
-
-
-def test_arrays_of_one_name_are_refused(tmp_path: Path) -> None:
-    content = io.BytesIO()
-    np.save(content, np.arange(5.0))
-    with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
-        archive.writestr("x.npy", content.getvalue())
-        with pytest.warns(UserWarning, match="Duplicate name"):
-            archive.writestr("x.npy", content.getvalue())
-    with pytest.raises(ValueError, match="a.npz .*names of their own: 'x' comes 2 times"):
-        ep.inspect_file(tmp_path / "a.npz")
-    with pytest.raises(ValueError, match=r"a name must mean one value: 'a\.b' means two"):
-        leaves({"a.b": 1, "a": {"b": 2}})
 
 
 def written(path: Path, *, time: str = "s", **packing: object) -> Path:

@@ -155,12 +155,6 @@ def test_too_few_samples_count_as_not_identified_and_say_why() -> None:
     assert reasons["plain", 20.0, 50.0] == ""
 
 
-def test_a_variant_that_cannot_run_at_all_is_an_error() -> None:
-    broken = replace(VARIANT, bootstraps=ep.Bootstraps(n=1, n_culled=6))
-    with pytest.raises(ValueError, match="n_culled must leave a term"):
-        frontier(variants={"broken": broken})
-
-
 def test_leaving_a_variant_out_changes_no_other() -> None:
     both, alone = frontier(), frontier(variants={"resampled": RESAMPLED})
     kept = both[both["variant"] == "resampled"].reset_index(drop=True)
