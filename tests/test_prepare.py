@@ -178,12 +178,6 @@ def test_the_rate_comes_from_a_table(tmp_path: Path) -> None:
     assert np.isnan(after["R_ion"].values[:, 2]).all()
 
 
-def test_a_table_is_not_extrapolated(tmp_path: Path) -> None:
-    (tmp_path / "rates.csv").write_text("1,1e-22\n15,5e-14\n")
-    with pytest.raises(ValueError, match="1 to 15 eV: it runs from 5 to 20 eV; extend .*rates.csv"):
-        ionization_rate(precompile(), table=tmp_path / "rates.csv")
-
-
 @pytest.mark.parametrize("text", ["1,1e-22\n", "5,1\n1,2\n", "a,b\nc,d\n"])
 def test_a_bad_table_is_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "rates.csv").write_text(text)

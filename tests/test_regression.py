@@ -56,14 +56,6 @@ def test_block_split_holds_out_whole_blocks() -> None:
     assert np.all(np.ptp(held_out.reshape(20, 20).astype(int), axis=1) == 0)
 
 
-@pytest.mark.parametrize(
-    ("split", "fraction"), [(ep.regression.RandomSplit, 1.0), (ep.regression.BlockSplit, -0.1)]
-)
-def test_impossible_shares_are_refused(split: type, fraction: float) -> None:
-    with pytest.raises(ValueError, match=r"test_fraction must lie in \[0, 1\)"):
-        split(fraction)
-
-
 def test_gram_matrix_is_the_weighted_product_of_unit_columns() -> None:
     rng = np.random.default_rng(0)
     theta, target = rng.normal(size=(30, 3)) * [1e18, 1.0, 1e-14], rng.normal(size=(30, 1))

@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 from scipy.signal import periodogram
 
-from ep2sindy.library.units import Clock
 from ep2sindy.signals import smoothers
 from ep2sindy.signals.smoothers import NoSmoothing, SavitzkyGolay, difference
 from ep2sindy.signals.spectrum import dominant_frequency, power_spectrum
@@ -89,14 +88,3 @@ def test_a_spectrum_is_that_of_scipy(n: int) -> None:
     theirs = periodogram(x, 1e3, window="hann", detrend="constant")
     for ours, other in zip(power_spectrum(t, x), theirs, strict=True):
         np.testing.assert_allclose(ours, other, rtol=1e-10, atol=1e-20)
-
-
-def test_times_read_in_the_unit_that_a_file_counts_them_in() -> None:
-    year = Clock.of("year")
-    assert year.frequency_text(1.0 / (10.0 * year.seconds)) == "0.1 per year"
-    assert year.duration_text(21.0 * year.seconds) == "21 years"
-    assert year.rate_unit("1") == "year^-1"
-    assert Clock.of("ms") == Clock()  # the second's parts go by prefixes
-    assert Clock.of("1e-06 s") == Clock()
-    assert Clock().duration_text(182e-6) == "182 µs"
-    assert Clock().rate_unit("m^-3") == "m^-3 s^-1"

@@ -224,18 +224,6 @@ def test_a_first_column_of_another_name_is_no_time_unless_the_user_says_so(tmp_p
     assert note == "a field needs time: give the step between samples, data.dt_s=STEP in s"
 
 
-def test_a_preamble_next_to_the_rows_says_units(tmp_path: Path) -> None:
-    """As oscilloscopes of the series TDS write it."""
-    labels = ["Sample Interval,1.5e-06", "Vertical Units,mV", "Horizontal Units,s", "Pt Fmt,Y"]
-    lines = [f"{label},,{t:.9e},{x:.9e}," for label, t, x in zip(labels, T, X, strict=False)]
-    lines += [f",,,{t:.9e},{x:.9e}," for t, x in zip(T[4:], X[4:], strict=True)]
-    (tmp_path / "a.csv").write_text("\n".join(lines) + "\n")
-    found = ep.inspect_file(tmp_path / "a.csv")
-    assert found.time == ep.data.Variable("3", "s")
-    assert not found.notes()
-    np.testing.assert_allclose(ep.open_field(tmp_path / "a.csv")["column_4"].values, 1e-3 * X)
-
-
 def test_the_whole_file_decides_which_columns_are_kept(tmp_path: Path) -> None:
     """A column may end long before the others, or begin beyond the lines that are looked at."""
     n = 3000

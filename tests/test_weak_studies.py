@@ -95,13 +95,6 @@ def test_levels_of_noise_share_their_draws() -> None:
     assert large / small == pytest.approx(2.0, rel=0.05)
 
 
-@pytest.mark.parametrize("nothing", [{"noises": []}], ids=str)
-def test_errors_of_nothing_are_refused(nothing: dict) -> None:
-    defaults = {"forms": {"boxes": boxes(10, 2)}, "noises": [0.0], "n_realizations": 1}
-    with pytest.raises(ValueError, match="there must be something to run"):
-        coefficient_errors(sampled(), **(defaults | nothing))
-
-
 def test_weak_windows_runs_at_toy_size(tmp_path: Path) -> None:
     found = programs.computed(programs.composed(*test_experiment_fits.weak_windows(tmp_path)))
     cells = found.summary["cells"]
