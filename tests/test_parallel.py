@@ -2,7 +2,6 @@ import os
 import signal
 import subprocess
 import sys
-import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import nullcontext
 from functools import partial
@@ -213,11 +212,6 @@ def test_pieces_that_are_alike_leave_this_process_only_where_it_pays(
     assert not list(run_alike(Loky(n_jobs=2), process_of, [], 0))
 
 
-def test_a_number_of_processes_must_be_one() -> None:
-    with pytest.raises(ValueError, match="n_jobs must be a number of processes"):
-        Loky(n_jobs=0)
-
-
 WITHIN = """
 import threading
 from ep2sindy.runtime.parallel import Loky
@@ -306,12 +300,3 @@ def test_workers_end_with_their_run(tmp_path: Path, name: str, work: str) -> Non
         stated = run.stdout.read()
     assert not alive
     assert stated == ("" if name == "SIGKILL" else f"interrupted by {name}\n")
-
-
-def test_workers_that_are_replaced_cause_no_warning_and_others_still_do() -> None:
-    with warnings.catch_warnings(record=True) as heard:
-        warnings.simplefilter("always")
-        assert sorted(Loky(2).run(abs, [-1, -2])) == [(0, 1), (1, 2)]
-        warnings.warn("A worker stopped while some jobs were given to the executor.", stacklevel=1)
-        warnings.warn("a piece was lost", stacklevel=1)
-    assert [str(each.message) for each in heard] == ["a piece was lost"]

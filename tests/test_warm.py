@@ -7,7 +7,6 @@ import subprocess
 import sys
 from pathlib import Path
 from shutil import copytree
-from types import SimpleNamespace
 
 import pytest
 
@@ -109,22 +108,6 @@ def test_a_kernel_is_kept_where_one_may_write_and_follows_what_it_calls(
     assert not list(kernels.rglob("*.nbi"))
 
 
-@pytest.mark.usefixtures("compilations")
-def test_an_administrator_puts_kernels_next_to_the_package(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    made, lacking = tmp_path / "cache" / "kernels" / "model_1", tmp_path / "none"
-    made.mkdir(parents=True)
-    (made / "a.nbi").write_text("index")
-    monkeypatch.setattr(precompile, "folders", lambda: [made, lacking])
-    monkeypatch.setattr(precompile, "SHARED", tmp_path / "shared")
-    for _ in range(2):
-        precompile.main(["--shared"])
-        stamp, kernel = sorted((tmp_path / "shared").iterdir(), reverse=True)
-        assert stamp.name.startswith("warm_")
-        assert (kernel / "a.nbi").read_text() == "index"
-
-
 def test_without_a_folder_kernels_are_compiled_every_time_and_it_is_reported(kernels: Path) -> None:
     run = called(kernels, EP2SINDY_CACHE="/dev/null")
     assert run.stdout == "5.0\n"
@@ -146,15 +129,6 @@ def test_a_folder_that_cannot_be_written_costs_no_run(
     assert len(compilations) == 3
     with pytest.raises(SystemExit, match="error: .*cannot be a cache: "):
         precompile.main([])
-
-
-def test_a_call_that_compiles_says_so_once(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(compilation, "_ANNOUNCED", [])
-    for _ in range(3):
-        compilation._Listener().on_start(SimpleNamespace(data={}))
-    assert capsys.readouterr().err == f"{compilation.ANNOUNCEMENT}\n"
 
 
 @pytest.mark.parametrize("part", precompile.PARTS)
