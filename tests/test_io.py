@@ -352,6 +352,23 @@ def test_a_field_is_written_and_read_back_whole(tmp_path: Path) -> None:
     assert again["n_i"].identical(field["n_i"])
 
 
+def test_a_written_field_is_netcdf(tmp_path: Path) -> None:
+    field = open_field(npz(tmp_path), **SETTINGS)
+    with pytest.raises(ValueError, match=r"to a name that ends in .nc, got .*field.h5"):
+        write_field(field, tmp_path / "field.h5")
+    with pytest.raises(ValueError, match=r"a written field is NetCDF: .*a.npz is not"):
+        read_field(tmp_path / "a.npz")
+
+
+def test_chunks_without_dask_name_the_extra(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ep2sindy.data.open.find_spec", lambda name: None)
+    write_netcdf4(tmp_path / "a.nc")
+    with pytest.raises(ValueError, match=r"data.chunks needs dask: pip install .*files"):
+        open_field(tmp_path / "a.nc", **SETTINGS, chunks={"time": 2})
+
+
 def test_chunks_stream_a_file(tmp_path: Path) -> None:
     pytest.importorskip("dask")
     write_netcdf4(tmp_path / "a.nc")
