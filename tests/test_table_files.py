@@ -2,6 +2,7 @@
 
 from importlib import util
 from pathlib import Path
+from zipfile import ZipFile
 
 import numpy as np
 import pandas as pd
