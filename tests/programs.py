@@ -77,7 +77,7 @@ class Computed:
 
 
 def computed(config: DictConfig) -> Computed:
-    """A study, run with bands of forecasts that few starts calibrate: many take most of its time."""
+    """A study. Bands of its forecasts are calibrated by few starts: many take most of the time."""
     forecasts = import_module("ep2sindy.forecasting.forecast")
     with patch.object(forecasts, "N_STARTS", 10), start_run(config) as report:
         kind = study_class(config.study)
