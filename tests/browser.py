@@ -60,7 +60,7 @@ def seen(
 
     questions: expressions of JavaScript, by name.
     """
-    pytest.importorskip("tornado", reason="talks to Chromium; comes with `distributed`")
+    pytest.importorskip("tornado", reason="talks to Chromium; comes with `ipykernel`")
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
         process = subprocess.Popen(
             [

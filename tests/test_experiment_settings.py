@@ -36,7 +36,6 @@ STRAIGHT = ", ".join(f"{{V_D_V: {300 + 10 * k}, mdot_mg_s: {4 + k}}}" for k in r
         ("predict", ["models.conserving.terms.n_i=[n_i,u_iz]"], "conserving cannot hold: relation"),
         ("predict", [f"points=[{FEW}]"], "a law of 3 functions of ['V_D_V', 'mdot_mg_s'] needs m"),
         ("predict", [f"points=[{STRAIGHT}]"], "4 points do not tell the 3 terms of a law apart"),
-        ("simulate", ["scan={operating_point.volts:[1]}"], "operating_point.volts must be there"),
         ("weak", ["fits.boxes.form=box"], "fits.boxes.form must be null, balance or one of ['boxe"),
         ("weak", ["fits.boxes.n_points=[1201]"], "1201 samples were asked of 1200; lower n_points"),
     ],

@@ -1,4 +1,4 @@
-"""`+exp=simulate`: one run, a scan with points that break, and what studies say of simulations."""
+"""`+exp=simulate`: one run, one that breaks, and what studies say of simulations."""
 
 from pathlib import Path
 
@@ -13,12 +13,10 @@ from ep2sindy.app.schema import Configured, plain, study_of
 from ep2sindy.figures import breathing
 from ep2sindy.runtime.files import WriteError
 from ep2sindy.studies import points as studied
-from ep2sindy.studies.scan import scan_points
 from ep2sindy.studies.source import DivergedError, amiss, check_recorded, compile_kernels, doubts
 from tests import programs
 from tests.programs import summary_of
 
-VOLTAGES = "scan={operating_point.voltage:[-5.0,250.0,300.0,5000.0]}"
 GOOD = {
     "status": "oscillating", "cycle": "strong", "f_kHz": 14.0, "I_d_mean": 4.0, "I_d_std": 5.0,
     "parameters": "{}", "mass_balance": 1.0, "energy_balance": 0.9996, "rates": "covered",
@@ -54,12 +52,6 @@ def one(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def field(one: Path) -> xr.Dataset:
     with xr.open_dataset(one / "field.nc", engine="h5netcdf", decode_times=False) as stored:
         return stored.load()
-
-
-@pytest.fixture(scope="module")
-def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A voltage that cannot be, two that breathe, one whose run breaks at once."""
-    return run_config(composed(*toy(tmp_path_factory.mktemp("scan")), VOLTAGES))
 
 
 def test_a_run_keeps_its_field_and_says_what_it_did(one: Path, field: xr.Dataset) -> None:
@@ -109,50 +101,25 @@ def test_fields_over_r_are_averaged_by_area(field: xr.Dataset) -> None:
     )
 
 
-def test_a_point_that_breaks_keeps_its_row_and_the_others_stand(scan: Path) -> None:
-    points = summary_of(scan)["points"]
-    assert [point["status"] for point in points] == [
-        "failed", "oscillating", "oscillating", "diverged",
-    ]  # fmt: skip
-    assert [point["operating_point.voltage"] for point in points] == [-5.0, 250.0, 300.0, 5000.0]
-    assert "voltage must be finite and positive" in points[0]["message"]
-    for point in points[1:3]:
-        assert point["I_d_mean"] > 1.0
-        assert point["mass_balance"] == pytest.approx(1.0, abs=1e-3)
-    assert points[3]["thrust_N"] is None
-    rows = pd.read_csv(scan / "tables" / "points.csv")
-    assert rows["status"].tolist() == [point["status"] for point in points]
-    # One of the three that ran has diverged; one never ran.
-    assert len(list((scan.parents[2] / "cache").glob("*.nc"))) == 3
-    assert (scan / "figures" / "curves.png").stat().st_size > 8e3
-
-
-def test_a_scan_ends_where_its_runs_cannot_be_kept(tmp_path: Path) -> None:
-    """A full disk is not the fault of a point: it had a row `failed`, and the scan continued."""
+def test_a_run_that_cannot_be_cached_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "cache").write_text("a file, and no folder")
-    config = composed(*toy(tmp_path), VOLTAGES)
     with pytest.raises(WriteError, match="cache could not be written"):
-        run_config(config)
+        run_config(composed(*toy(tmp_path)))
 
 
-def test_a_place_that_the_config_leaves_to_its_default_can_be_scanned() -> None:
+def test_a_place_that_the_config_leaves_to_its_default_can_be_changed() -> None:
     data = Configured(plain(composed().data), "data")
-    points = scan_points(data, {"thruster.transport.c_plume": [0.01, 0.02], "cfl": [0.5]})
-    transport = [point.data.settings["thruster"]["transport"] for point in points]
-    assert [each["c_plume"] for each in transport] == [0.01, 0.02]
-    assert transport[0]["_target_"] == "ep2sindy.thruster.AnomalousTransport"
-    assert transport[0]["c_channel"] == transport[1]["c_channel"] > 0.0
-    assert points[0].label == "thruster.transport.c_plume=0.01, cfl=0.5"
-    assert points[0].data.settings["progress"] is False
+    changed = data.changed({"thruster.transport.c_plume": 0.02, "cfl": 0.5})
+    transport = changed.settings["thruster"]["transport"]
+    assert transport["_target_"] == "ep2sindy.thruster.AnomalousTransport"
+    assert transport["c_plume"] == 0.02
+    assert transport["c_channel"] > 0.0
     assert "transport" not in data.settings["thruster"]
 
 
 def test_kernels_are_compiled_without_a_trace(tmp_path: Path) -> None:
-    config = composed(*toy(tmp_path), VOLTAGES)
-    points = scan_points(
-        Configured(plain(config.data), "data"), {"operating_point.voltage": [-5.0, 300.0]}
-    )
-    compile_kernels([point.data for point in points])
+    data = Configured(plain(composed(*toy(tmp_path)).data), "data")
+    compile_kernels([data.changed({"operating_point.voltage": v}) for v in (-5.0, 300.0)])
     assert not (tmp_path / "cache").exists()
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import pickle
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -173,47 +172,20 @@ def _square(x: np.ndarray) -> np.ndarray:
     return x * x
 
 
+def _double(x: np.ndarray) -> np.ndarray:
+    return 2.0 * x
+
+
 def test_a_function_of_ones_own_travels_with_its_derivative(
     kinds: dict[str, registry.Kind],
 ) -> None:
-    ep.register_function("own_square", _square)
+    ep.register_function("own_square", _square, _double)
     sent = pickle.dumps(named_terms(["x"], ["own_square(x)", "sin(x)"]))
     del kinds["own_square"]
     library = pickle.loads(sent)  # as in a worker, where nobody registered it
     assert library.evaluate(np.array([[3.0]]))[0, 0] == 9.0
     assert slopes_of(library, np.array([[3.0]]))[0, 0, 0] == pytest.approx(6.0)
     assert named_terms(["x"], ["own_square(2*x)"]).evaluate(np.array([[3.0]]))[0, 0] == 36.0
-
-
-def _hill(x: np.ndarray) -> np.ndarray:
-    return x**2 / (0.25 + np.square(x))
-
-
-FORMULAS = {
-    "tanh": (np.tanh, lambda x: 1.0 - np.tanh(x) ** 2),
-    "hill": (_hill, lambda x: 0.5 * x / (0.25 + x**2) ** 2),
-    "drag": (lambda x: x * np.abs(x), lambda x: 2.0 * np.abs(x)),
-    "line": (lambda x: 3.0 - 2.0 * x, lambda x: np.full(x.shape, -2.0)),
-    "bell": (lambda x: np.exp(-(x**2) / 2.0), lambda x: -x * np.exp(-(x**2) / 2.0)),
-}
-
-
-@pytest.mark.parametrize("name", FORMULAS)
-def test_the_derivative_of_a_formula_is_found_by_itself(
-    name: str, kinds: dict[str, registry.Kind]
-) -> None:
-    value, slope = FORMULAS[name]
-    ep.register_function(f"own_{name}", value)
-    found, x = kinds[f"own_{name}"], np.linspace(-1.4, 1.5, 60).reshape(3, 20)
-    assert found.slope(x) == pytest.approx(slope(x), rel=1e-12, abs=1e-15)
-    assert found.slope(x).shape == x.shape
-
-
-@pytest.mark.parametrize("value", [lambda x: np.where(x > 0.0, x, 0.0), np.arctanh, np.sum])
-def test_what_is_no_formula_needs_a_derivative(value: Callable[..., object]) -> None:
-    message = r"derivative is found by itself for a formula of .*'odd' is none.*'odd', value, deri"
-    with pytest.raises(ValueError, match=message):
-        ep.register_function("odd", value, domain=(-0.9, 0.9))
 
 
 @pytest.mark.parametrize(

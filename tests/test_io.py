@@ -3,7 +3,6 @@ from pathlib import Path
 
 import h5py
 import numpy as np
-import pandas as pd
 import pytest
 import xarray as xr
 from hydra.utils import instantiate
@@ -278,25 +277,14 @@ def write_text(path: Path) -> None:
     path.write_text("t, Id\n0, 1\n")
 
 
-def write_excel(path: Path) -> None:
-    pd.DataFrame({"t": TIME, "Id": I_D}).to_excel(path, index=False, engine="openpyxl")
-
-
-def write_parquet(path: Path) -> None:
-    pd.DataFrame({"t": TIME, "Id": I_D}).to_parquet(path)
-
-
 def write_tdms(path: Path) -> None:
     with TdmsWriter(path) as writer:
         writer.write_segment([ChannelObject("a", n, x) for n, x in (("t", TIME), ("Id", I_D))])
 
 
-TABLES = {"table.xlsx": write_excel, "table.parquet": write_parquet, "daq.tdms": write_tdms}
-
 KINDS = {
     **WRITERS,
-    **TABLES,
-    "book.dat": write_excel,
+    "daq.tdms": write_tdms,
     "classic.cdf": write_netcdf3,
     "field.nc4": write_netcdf4,
     "field.dat": write_hdf5,
@@ -311,6 +299,12 @@ def test_hdf5_is_recognised_as_its_own_library_does(tmp_path: Path, name: str) -
     KINDS[name](tmp_path / name)
     is_hdf5 = not name.endswith("zarr") and h5py.is_hdf5(tmp_path / name)
     assert (look_at(tmp_path / name)[0] == "hdf5") is is_hdf5
+
+
+KNOWN = (
+    r"MATLAB \(v5, v7.3\), npy, TDMS, NetCDF, HDF5 or npz, or end in .csv, .* or "
+    ".zarr: "
+)
 
 
 @pytest.mark.parametrize(
@@ -329,7 +323,7 @@ def test_what_is_no_file_of_a_known_kind_is_refused(
         open_field(tmp_path / name, **SETTINGS)
 
 
-CUT = [n for n in (*WRITERS, "table.xlsx", "table.parquet") if not n.endswith("zarr")]
+CUT = [n for n in WRITERS if not n.endswith("zarr")]
 
 
 @pytest.mark.parametrize("fraction", [0.02, 0.5, 0.95])
@@ -350,6 +344,23 @@ def test_a_field_is_written_and_read_back_whole(tmp_path: Path) -> None:
     own = {axis: Variable(axis, v.unit) for axis, v in AXES.items()}
     again = open_field(tmp_path / "deep" / "field.nc", variables=variables, **own)
     assert again["n_i"].identical(field["n_i"])
+
+
+def test_a_written_field_is_netcdf(tmp_path: Path) -> None:
+    field = open_field(npz(tmp_path), **SETTINGS)
+    with pytest.raises(ValueError, match=r"to a name that ends in .nc, got .*field.h5"):
+        write_field(field, tmp_path / "field.h5")
+    with pytest.raises(ValueError, match=r"a written field is NetCDF: .*a.npz is not"):
+        read_field(tmp_path / "a.npz")
+
+
+def test_chunks_without_dask_name_the_extra(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ep2sindy.data.open.find_spec", lambda name: None)
+    write_netcdf4(tmp_path / "a.nc")
+    with pytest.raises(ValueError, match=r"data.chunks needs dask: pip install .*files"):
+        open_field(tmp_path / "a.nc", **SETTINGS, chunks={"time": 2})
 
 
 def test_chunks_stream_a_file(tmp_path: Path) -> None:

@@ -347,4 +347,5 @@ def _draw_errors(ax: Axes, skill: ForecastSkill) -> None:
         ax.plot(horizons, np.maximum(values, FLOOR), label=name, **look)
     ax.axhline(1.0, color=GREY, lw=0.8, ls="--")
     ax.set(yscale="log", ylabel="error (standard deviations)")
+    style.label_decades(ax)
     ax.set_xlabel(f"horizon ({skill.unit})")

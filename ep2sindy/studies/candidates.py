@@ -17,7 +17,7 @@ from ep2sindy.estimation.estimate import Estimate, Rival
 from ep2sindy.figures.fronts import front_figure
 from ep2sindy.library.equations import equation_text
 from ep2sindy.library.units import Clock
-from ep2sindy.regression.front import Candidate, LeftOver, ParetoFront
+from ep2sindy.regression.front import Candidate, ParetoFront, Residual
 from ep2sindy.report.document import Equation, Table, Text
 from ep2sindy.report.report import Report
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View
@@ -67,7 +67,7 @@ class CandidateRow:
 
     candidate: Candidate
     is_selected: bool = False
-    left: LeftOver | None = None
+    left: Residual | None = None
     lead: str = ""
 
     @property
