@@ -189,19 +189,18 @@ def test_a_function_of_ones_own_travels_with_its_derivative(
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "slope", "domain", "message"),
+    ("name", "value", "slope", "message"),
     [
-        ("sin", np.sin, np.cos, None, "'sin' is built in: give your function another name"),
-        ("wrong", np.sin, np.sin, None, "derivative of 'wrong' must be that of its value: at"),
-        ("sums", np.sum, np.cos, None, "value of 'sums' must give a finite number for each"),
+        ("sin", np.sin, np.cos, "'sin' is built in: give your function another name"),
+        ("wrong", np.sin, np.sin, "derivative of 'wrong' must be that of its value: at"),
+        ("sums", np.sum, np.cos, "value of 'sums' must give a finite number for each"),
     ],
 )
 def test_functions_that_cannot_be_are_refused(
-    name: str, value: object, slope: object, domain: object, message: str
+    name: str, value: object, slope: object, message: str
 ) -> None:
-    setting = {} if domain is None else {"domain": domain}
     with pytest.raises(ValueError, match=message):
-        ep.register_function(name, value, slope, **setting)
+        ep.register_function(name, value, slope)
     assert name == "sin" or name not in registry._kinds
 
 

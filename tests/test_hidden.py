@@ -244,20 +244,10 @@ def test_what_was_not_measured_counts_nothing() -> None:
     assert hessian_on(replace(fit, problem=moved), fit.support)[2] == pytest.approx(least)
 
 
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda: ep.discover(only("x"), hidden=["x"]), "one that no run has, got .'x'. with"),
-        (
-            lambda: ep.discover(only("x"), method=ep.Regression(), hidden=["g"]),
-            "a regression needs samples of every state",
-        ),
-        (
-            lambda: ep.model.estimate_states(ep.lorenz().model, only("z", system=ep.lorenz())),
-            "none of .'x', 'y'. does in those of .'z'.; measure one",
-        ),
-    ],
-)
-def test_what_cannot_be_hidden_is_refused(call, message) -> None:
-    with pytest.raises(ValueError, match=message):
-        call()
+def test_what_cannot_be_hidden_is_refused() -> None:
+    with pytest.raises(ValueError, match="one that no run has"):
+        ep.discover(only("x"), hidden=["x"])
+    with pytest.raises(ValueError, match="a regression needs samples of every state"):
+        ep.discover(only("x"), method=ep.Regression(), hidden=["g"])
+    with pytest.raises(ValueError, match="none of .'x', 'y'. does"):
+        ep.model.estimate_states(ep.lorenz().model, only("z", system=ep.lorenz()))
