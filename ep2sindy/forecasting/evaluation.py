@@ -320,15 +320,45 @@ def evaluate(
     assessed: Sequence[str] | None = None,
     n_fitted: int | None = None,
 ) -> Evaluation:
-    """Run a model over a record, or its first samples, and compare the attractors.
+    """Integrate a model over a record and compare the attractors of both.
 
-    model: a SparseModel, or a Discovery, whose lack of fit is then reported. run: a Trajectory, or
-    what `discover` takes as one run. initial: the state to start from, in SI; None takes the
-    data's. n_samples: of the run that are compared; None takes all. assessed: states that determine
-    the status and f_error, such as the measured one; None takes all. n_fitted: samples at the start
-    that the model was fitted to; it is then run over the rest, from the last of these, and
-    forecasts of the rest are counted. Raises ValueError for a assessed state that the model does
-    not have, or too few samples.
+    The result states whether the model sustains the record's oscillation, with its frequency,
+    amplitudes and waveform, and how stable its cycle is.
+
+    Parameters
+    ----------
+    model : SparseModel, or Discovery
+        The model. The lack of fit of a discovery is reported as well.
+    run : run
+        A Trajectory, or whatever `discover` takes as one run.
+    initial : array (n_states,), optional
+        State to start from, in SI. None takes the data's first sample.
+    n_samples : int, optional
+        Number of samples of the run that are compared. None takes all.
+    bounds : FreeRunBounds, optional
+        Largest deviations at which the run counts as sustained.
+    assessed : sequence of str, optional
+        States that determine the status and the frequency error, such as the measured one. None
+        takes all.
+    n_fitted : int, optional
+        Number of samples at the start that the model was fitted to. It is then integrated over the
+        rest, from the last of these, and forecasts of the rest are counted.
+
+    Returns
+    -------
+    Evaluation
+        The status, the deviations, and on demand cycle, rest points and forecasts.
+
+    Raises
+    ------
+    ValueError
+        If an assessed state is not in the model, or there are too few samples.
+
+    Examples
+    --------
+    >>> run = ep.lotka_volterra().trajectory(noise=0.02, rng=0)
+    >>> str(ep.evaluate(ep.lotka_volterra().model, run).status)
+    'sustained'
     """
     lack_of_fit, forecasts = "", None
     if isinstance(model, HoldsModel):

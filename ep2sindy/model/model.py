@@ -40,14 +40,45 @@ if TYPE_CHECKING:
 class SparseModel:
     """Equations x' = library(states, inputs) coef, in SI units.
 
-    coef: (terms, equations), zero outside the support. states: one name per equation.
-    units: of the states and of the library's variables. provenance: origin of the model.
-    covariance: (coefs, coefs) of the nonzero coefficients, in SI, ordered by equation and within
-    each equation in the order of the library; None if it is not known. clock: unit of time in which
-    the equations are shown; coefficients stay in SI. courses: input -> how it goes from one sample
-    to the next, "held" (at the value of the last one), "linear" or "smooth" (a cubic spline). An
-    input without one is held if its samples rest over most steps, and else smooth.
+    A model integrates (`simulate`, `rollout`), evaluates its right-hand side (`predict`), prints,
+    and is saved as JSON. Its arrays cannot be changed.
 
+    Parameters
+    ----------
+    library : Library
+        The terms. Facts of the equations are dropped.
+    states : sequence of str
+        One name per equation.
+    coef : array (terms, equations)
+        Coefficients in SI, zero outside the support.
+    units : mapping of str to str, default {}
+        Units of the states and of the library's variables. A name that is absent has the unit "1".
+    provenance : mapping of str to str, default {}
+        Record of how the model was found.
+    covariance : array (coefs, coefs), optional
+        Covariance of the nonzero coefficients in SI, ordered by equation and within each equation
+        in the order of the library. None if it is not known.
+    clock : Clock, default SECONDS
+        Unit of time in which the equations are displayed. Coefficients stay in SI.
+    courses : mapping of str to str, default {}
+        How each input goes from one sample to the next: "held" (at the value of the last one),
+        "linear" or "smooth" (a cubic spline). Other inputs are held if their samples rest over most
+        steps, and else smooth.
+
+    Raises
+    ------
+    ValueError
+        If states repeat, coefficients have another shape or are not finite, or the covariance has
+        another shape.
+
+    Notes
+    -----
+    The right-hand side is
+
+        x_s' = sum_j coef[j, s] theta_j(x, u)
+
+    Examples
+    --------
     >>> library = ep.polynomial(["x", "v"], degree=1)
     >>> spring = ep.model.coef_matrix(library, [{"v": 1.0}, {"x": -4.0}])
     >>> print(ep.SparseModel(library, ["x", "v"], spring).text())

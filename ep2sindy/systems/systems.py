@@ -98,7 +98,39 @@ def damped_oscillator(*, zeta: float = 0.1, omega: float = 3.0) -> System:
 
 
 def lotka_volterra(*, a: float = 2 / 3, b: float = 1.0, c: float = 1.0, d: float = 1 / 3) -> System:
-    """x' = a x - b x y, y' = c x y - d y."""
+    """The Lotka-Volterra system of prey x and predator y, a family of neutral cycles.
+
+    Parameters
+    ----------
+    a : float, default 2 / 3
+        Growth rate of the prey, in 1/s.
+    b : float, default 1.0
+        Rate at which predators reduce the prey.
+    c : float, default 1.0
+        Rate at which predators grow with the prey.
+    d : float, default 1 / 3
+        Death rate of the predators, in 1/s.
+
+    Returns
+    -------
+    System
+        The model, with an initial state and a sampling of 100 s at 10 Hz.
+
+    Notes
+    -----
+    The equations are
+
+        x' = a x - b x y
+        y' = c x y - d y
+
+    Source: Volterra 1926, doi:10.1038/118558a0.
+
+    Examples
+    --------
+    >>> print(ep.lotka_volterra(a=0.5).model.text())
+    x' = 0.5 x - 1 x y
+    y' = -0.333 y + 1 x y
+    """
     equations = {"x": {"x": a, "x*y": -b}, "y": {"y": -d, "x*y": c}}
     return _system("Lotka-Volterra", equations, 2, [1.0, 0.5], 100.0, 10.0)
 
@@ -110,7 +142,37 @@ def van_der_pol(*, mu: float = 2.0) -> System:
 
 
 def lorenz(*, sigma: float = 10.0, rho: float = 28.0, beta: float = 8 / 3) -> System:
-    """x' = sigma (y - x), y' = x (rho - z) - y, z' = x y - beta z."""
+    """The Lorenz system, the standard example of a chaotic attractor.
+
+    Parameters
+    ----------
+    sigma : float, default 10.0
+        Prandtl number.
+    rho : float, default 28.0
+        Relative Rayleigh number. At 28 the system is chaotic.
+    beta : float, default 8 / 3
+        Aspect ratio of the convection roll.
+
+    Returns
+    -------
+    System
+        The model, with an initial state and a sampling of 10 s at 300 Hz.
+
+    Notes
+    -----
+    The equations are
+
+        x' = sigma (y - x)
+        y' = x (rho - z) - y
+        z' = x y - beta z
+
+    Source: Lorenz 1963, `doi:10.1175/1520-0469(1963)020<0130:DNF>2.0.CO;2`.
+
+    Examples
+    --------
+    >>> ep.lorenz().trajectory(noise=0.05, rng=0).states.shape
+    (3000, 3)
+    """
     equations = {
         "x": {"x": -sigma, "y": sigma},
         "y": {"x": rho, "x*z": -1.0, "y": -1.0},
@@ -120,7 +182,33 @@ def lorenz(*, sigma: float = 10.0, rho: float = 28.0, beta: float = 8 / 3) -> Sy
 
 
 def pendulum(*, length: float = 1.0, gravity: float = 9.81) -> System:
-    """theta' = w, w' = -(gravity / length) sin(theta), in rad; released at 2 rad, for 20 s."""
+    """A pendulum without friction, released at 2 rad and followed for 20 s.
+
+    Parameters
+    ----------
+    length : float, default 1.0
+        Length in m.
+    gravity : float, default 9.81
+        Gravity in m/s^2.
+
+    Returns
+    -------
+    System
+        The model of the angle theta in rad and the angular velocity w in rad/s.
+
+    Notes
+    -----
+    The equations are
+
+        theta' = w
+        w' = -(gravity / length) sin(theta)
+
+    Examples
+    --------
+    >>> print(ep.pendulum().model.text())
+    theta' = 1 w
+    w' = -9.81 sin(theta)
+    """
     equations = {"theta": {"w": 1.0}, "w": {"sin(theta)": -gravity / length}}
     return _system("pendulum", equations, 1, [2.0, 0.0], 20.0, 100.0, ["sin"])
 
