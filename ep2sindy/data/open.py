@@ -245,7 +245,18 @@ def write_field(field: xr.Dataset, path: str | Path) -> None:
     """Write a field as NetCDF; the file appears under its name only once it is complete.
 
     The file is built in memory, which must be large enough.
-    Raises OSError if it cannot be written.
+
+    Parameters
+    ----------
+    field : Dataset
+        Field over time and z, r or both.
+    path : str or Path
+        The file to write.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written.
     """
     check_field(field)
     if Path(path).suffix != ".nc":
@@ -254,7 +265,18 @@ def write_field(field: xr.Dataset, path: str | Path) -> None:
 
 
 def read_field(path: str | Path) -> xr.Dataset:
-    """Open a field that `write_field` wrote; values are read when they are used."""
+    """Open a field that `write_field` wrote.
+
+    Parameters
+    ----------
+    path : str or Path
+        The NetCDF file.
+
+    Returns
+    -------
+    Dataset
+        The field. Its values are read when they are used.
+    """
     if reader_of(Path(path)) is not NETCDF:
         raise ValueError(f"a written field is NetCDF: {path} is not; open others with open_field")
     with damage_named(Path(path)):

@@ -108,9 +108,24 @@ def side_by_side(zones: Mapping[str, Zone | Sequence[float]], field: xr.Dataset)
 class ZoneAverage:
     """Settings of `zone_average` without the field, for use in a config.
 
-    zones: those of `zone_averages`, taken in place of the one zone; or a number, for as many parts
-    of that zone, of equal length in z, called z1, z2 and so on.
-    Raises ValueError for zones that are neither names with places nor a number of one or more.
+    Parameters
+    ----------
+    states : sequence of str
+        Names of the variables that become states.
+    zone : Zone, optional
+        Part of the grid. None takes the whole field.
+    products : sequence of str, default ()
+        Products whose averages become inputs.
+    axisymmetric : bool, default True
+        True if r is the radius of a cylinder.
+    zones : mapping of str to Zone or (from, to), or int, optional
+        The zones of `zone_averages`, in place of the one zone; or a number of parts of `zone`, of
+        equal length in z, called z1, z2 and so on.
+
+    Raises
+    ------
+    ValueError
+        If zones are neither names with places nor a number of one or more.
     """
 
     states: Sequence[str]
@@ -199,7 +214,17 @@ class ZoneAverage:
 
 @dataclass(frozen=True)
 class GridPoint:
-    """Settings of `point_samples` without the field, for use in a config; it has no products."""
+    """Settings of `point_samples` without the field, for use in a config; it has no products.
+
+    Parameters
+    ----------
+    states : sequence of str
+        Names of the variables that become states.
+    z : float, optional
+        Place in m. Needed if the field has z.
+    r : float, optional
+        Place in m. Needed if the field has r.
+    """
 
     states: Sequence[str]
     z: float | None = None
@@ -233,9 +258,30 @@ def point_samples(
 ) -> Trajectory:
     """Samples at the grid point nearest to (z, r).
 
-    z, r: place in m; one is needed for each axis that the field has.
+    Parameters
+    ----------
+    field : Dataset
+        Field over time and z, r or both.
+    z : float, optional
+        Place in m. Needed if the field has z.
+    r : float, optional
+        Place in m. Needed if the field has r.
+    states : sequence of str
+        Names of the variables that become states.
+    inputs : sequence of str, default ()
+        Names of the variables that become inputs.
+    label : str, default ''
+        Label of the trajectory.
 
-    Raises ValueError for a place outside the grid's cells or without plasma.
+    Returns
+    -------
+    Trajectory
+        The samples over time.
+
+    Raises
+    ------
+    ValueError
+        If the place lies outside the grid's cells or holds no plasma.
     """
     nearest = _nearest(field, z=z, r=r)
     return zone_average(field.isel(nearest), None, states=states, inputs=inputs, label=label)

@@ -51,15 +51,14 @@ class Trajectory:
 
     Parameters
     ----------
-    t : array (samples,)
+    t : (samples,) array
         Times in s, increasing. Steps may be unequal. Dates are counted from the first, in s.
-    states : array (samples, n_states)
+    states : (samples, n_states) array
         Samples of the states, in SI.
     state_names : sequence of str
         One name per column of `states`.
-    inputs : array (samples, n_inputs), optional
-        Samples of what drives the states from outside, such as a voltage. By default there are
-        none.
+    inputs : (samples, n_inputs) array, default none
+        Samples of what drives the states from outside, such as a voltage.
     input_names : sequence of str, default ()
         One name per column of `inputs`.
     units : mapping of str to str, default {}
@@ -68,7 +67,7 @@ class Trajectory:
         Name of the record, shown in figures and tables.
     clock : Clock, default SECONDS
         Unit in which times are displayed. `t` stays in s.
-    missing : bool array (samples, n_states), optional
+    missing : (samples, n_states) bool array, optional
         True where a state was not measured, such as a channel of a slower rate. Samples there may
         be NaN and are interpolated. None means that all were measured.
     parameters : mapping of str to float, default {}

@@ -58,7 +58,7 @@ def zone_average(
     inputs : sequence of str, default ()
         Names of the variables that become inputs.
     products : sequence of str, default ()
-        Each product, such as "n_i*n_n*R_ion", adds an input named `<n_i*n_n*R_ion>` with the
+        Each product, such as `"n_i*n_n*R_ion"`, adds an input named `<n_i*n_n*R_ion>` with the
         average of the product, which is not the product of averages. If a variable's attribute
         `average_of` names the product, that variable is used, since it is averaged in time as a
         simulation's samples are.
