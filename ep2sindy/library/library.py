@@ -43,7 +43,7 @@ class Library:
     ----------
     variables : sequence of str
         Names of the variables, states first.
-    exponents : int array (terms, factors)
+    exponents : (terms, factors) int array
         Powers of the variables, then of the functions, in each term. They are not negative. A row
         of zeros is the constant.
     functions : sequence of Function, default ()
@@ -113,7 +113,7 @@ class Library:
         return replace(joined, facts=self.facts | other.facts)
 
     def relate(self, *relations: Relation | str) -> Library:
-        """With linear relations between coefficients, "x: x*y == -1 * y: x*y" or "x: y == 1".
+        """With linear relations of coefficients, `"x: x*y == -1 * y: x*y"` or `"x: y == 1"`.
 
         They hold in the search, in the selection and in the model; numbers are in SI.
         """
@@ -288,8 +288,15 @@ class Library:
     def evaluate(self, values: Any) -> Any:
         """Evaluate every term at every sample.
 
-        values: (..., variables), a NumPy array or a torch tensor, in the order of `variables`.
-        Returns (..., terms), of the same kind.
+        Parameters
+        ----------
+        values : array or torch tensor (..., variables)
+            Samples, in the order of `variables`.
+
+        Returns
+        -------
+        (..., terms) array or torch tensor
+            The terms, of the same kind.
         """
         check_values(len(self), values.shape)
         xp = array_namespace(values)

@@ -231,16 +231,30 @@ class Roles:
         )
 
     def in_zones(self, sizes: Mapping[str, float]) -> Roles:
-        """These roles in adjoining zones of one place, in the order in which the states move on.
+        """These roles in adjoining zones, in the order in which the states move on.
 
-        sizes: zone -> its length or volume. States become those of `zone_averages`, `n_i@exit`.
-        What states exchange in a zone, they exchange by their product, alone or times one more
+        What states exchange in a zone, they exchange by their product, by itself or times one more
         density of the zone or of the giver in a neighbouring zone. Every state with a role moves
-        from each zone to the next by terms that it is a factor of, alone or times one other density
-        of its zone or its own in the next one. It enters the first zone and leaves the last. In the
-        mean all of them go forward. A number as inflow is that of all zones together, as if they
-        were one.
-        Raises ValueError for terms, which are of one zone's equations.
+        from each zone to the next by terms that it is a factor of, by itself or times one other
+        density of its zone or its own in the next one. It enters the first zone and leaves the
+        last. In the mean all of them go forward. A number as inflow is that of all zones together,
+        as if they were one.
+
+        Parameters
+        ----------
+        sizes : mapping of str to float
+            Length or volume of each zone. States become those of `zone_averages`, such as
+            `n_i@exit`.
+
+        Returns
+        -------
+        Roles
+            The roles of all zones.
+
+        Raises
+        ------
+        ValueError
+            If the roles name terms, which belong to one zone's equations.
         """
         named = [role.giver or not isinstance(role.how, str | Mapping) for role in self._roles]
         several = any("+" in role.name for role in self._roles)
