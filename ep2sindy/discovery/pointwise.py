@@ -51,12 +51,27 @@ LAYOUT: Mapping[str, tuple[str, ...]] = {
 class PointSearch:
     """Settings of the search at every point, whose spread is taken over the bootstraps.
 
-    library: with relations between coefficients, if there are some, such as
-    "n_i: S == -1 * n_n: S" for ionization S, which makes of a neutral an ion; the same at every
-    point.
-    least_variation: standard deviation of every state, as a fraction of its root mean square, below
-    which a point counts as having no dynamics. seed: every point has the same split and the same
-    draws, so that results differ by place alone.
+    Parameters
+    ----------
+    states : sequence of str
+        Names of the field's variables that become states.
+    library : Library
+        Terms, with relations between coefficients if there are some, such as
+        "n_i: S == -1 * n_n: S" for ionization S, which turns a neutral into an ion. They are the
+        same at every point.
+    method : Regression
+        The regression, with bootstraps.
+    least_variation : float, default 0.001
+        Standard deviation of every state, as a fraction of its root mean square, below which a
+        point counts as having no dynamics.
+    seed : int, default 0
+        Every point has the same split and the same draws, so that results differ only by place.
+
+    Raises
+    ------
+    ValueError
+        If a setting is of the wrong kind or out of range, the method has no bootstraps, relations
+        contradict each other or meet bootstraps that leave out terms, or the library has roles.
     """
 
     states: Sequence[str]

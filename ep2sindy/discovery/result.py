@@ -206,7 +206,25 @@ class Discovery:
     ) -> Forecast:
         """Forecast from the end of a record, with bands; see `ep.forecast`.
 
-        history: the samples before the forecast. horizon: a duration or times, in s.
+        Parameters
+        ----------
+        history : run
+            The samples before the forecast.
+        horizon : float or array-like
+            Duration in s, or times in s.
+        fitted_to : run, optional
+            The record that the model was fitted to. None takes the history.
+        inputs : array-like or mapping of str to any, optional
+            Inputs of a driven model over the horizon.
+        n_draws : int, default 200
+            Number of runs of which the bands are made.
+        seed : int, default 0
+            Of the random draws.
+
+        Returns
+        -------
+        Forecast
+            Median and bands.
         """
         return forecast(
             self.model, history, horizon, fitted_to=fitted_to, inputs=inputs, n_draws=n_draws,
