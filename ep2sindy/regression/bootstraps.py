@@ -58,8 +58,9 @@ class Bootstraps:
 
     of draw k, with W_k the diagonal of how often each row was drawn. Assumes that the groups of
     rows are exchangeable; with block above 1, that rows farther apart than a block are
-    uncorrelated. Source: the thesis, II-C and II-H; Kuensch 1989, doi:10.1214/aos/1176347265, for
-    blocks.
+    uncorrelated.
+
+    Source: the thesis, II-C and II-H; Kuensch 1989, doi:10.1214/aos/1176347265, for blocks.
 
     Examples
     --------

@@ -36,7 +36,18 @@ class Split(Protocol):
 
 @dataclass(frozen=True)
 class RandomSplit:
-    """Hold out a random fraction of the groups of each trajectory, as in the thesis."""
+    """Hold out a random fraction of the groups of each trajectory, as in the thesis.
+
+    Parameters
+    ----------
+    test_fraction : float, default 0.25
+        Fraction that is held out.
+
+    Raises
+    ------
+    ValueError
+        If the fraction is out of range.
+    """
 
     test_fraction: float = 0.25
 
@@ -53,6 +64,18 @@ class BlockSplit:
 
     Neighbours in a time series are correlated, so randomly held-out rows would resemble training
     rows.
+
+    Parameters
+    ----------
+    test_fraction : float, default 0.25
+        Fraction that is held out.
+    n_blocks : int, default 20
+        Number of blocks into which a trajectory is cut.
+
+    Raises
+    ------
+    ValueError
+        If the fraction is out of range, or there is no block.
     """
 
     test_fraction: float = 0.25
@@ -102,8 +125,9 @@ class Differential:
         x'(t_k) = sum_j c_j theta_j(x(t_k), u(t_k))
 
     and the search minimises |x' - Theta c|^2 over all training rows. Assumes that the error of the
-    derivative is independent from row to row, which smoothing violates. Source: Brunton, Proctor &
-    Kutz 2016, doi:10.1073/pnas.1517384113; the thesis, II.
+    derivative is independent from row to row, which smoothing violates.
+
+    Source: Brunton, Proctor & Kutz 2016, doi:10.1073/pnas.1517384113; the thesis, II.
 
     Examples
     --------
@@ -217,8 +241,9 @@ class Weak:
         -integral phi_k' x dt = sum_j c_j integral phi_k theta_j(x, u) dt
 
     divided by the integral of phi_k, and the search minimises the squared difference of both sides
-    over all training rows. Source: Messenger & Bortz 2021, doi:10.1137/20M1343166; the thesis, Eqs.
-    10 and 11, for boxes.
+    over all training rows.
+
+    Source: Messenger & Bortz 2021, doi:10.1137/20M1343166; the thesis, Eqs. 10 and 11, for boxes.
 
     Examples
     --------
@@ -401,8 +426,9 @@ class WeightedWeak:
 
     Assumes that the noise of the samples is white, and the law in the library: fast dynamics that
     no term describes would be taken for noise. Rows are in the unit of the derivative, up to a
-    factor. Source: Bortz, Messenger & Dukic 2023, doi:10.1007/s11538-023-01208-6, for the
-    covariance.
+    factor.
+
+    Source: Bortz, Messenger & Dukic 2023, doi:10.1007/s11538-023-01208-6, for the covariance.
 
     Examples
     --------

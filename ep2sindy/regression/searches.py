@@ -68,8 +68,9 @@ class AdaptiveLasso:
 
     Assumes that the least squares b_ols of all terms are consistent: large where a term is true,
     small where it is not. Noise in the terms and nearly dependent columns violate this. The path is
-    piecewise linear in lambda (`search_kernels.lasso_path`). Source: Zou 2006,
-    doi:10.1198/016214506000000735; the thesis, Eq. 8.
+    piecewise linear in lambda (`search_kernels.lasso_path`).
+
+    Source: Zou 2006, doi:10.1198/016214506000000735; the thesis, Eq. 8.
 
     Examples
     --------
@@ -128,8 +129,10 @@ class STLSQ:
         |y - X b|^2 + threshold^2 |S|
 
     Assumes that the terms are nearly orthogonal, so that a false one has a small coefficient from
-    the first fit on: a term that was dropped never returns. Source: Brunton, Proctor & Kutz 2016,
-    doi:10.1073/pnas.1517384113; Zhang & Schaeffer 2019, doi:10.1137/18M1189828, for the objective.
+    the first fit on: a term that was dropped never returns.
+
+    Source: Brunton, Proctor & Kutz 2016, doi:10.1073/pnas.1517384113; Zhang & Schaeffer 2019,
+    doi:10.1137/18M1189828, for the objective.
 
     Examples
     --------
@@ -197,7 +200,9 @@ class BestSubset:
     Assumes Gaussian residuals that are independent from row to row, of one variance; then the best
     support of a size is the likeliest. The work grows with the number of subsets of up to max_terms
     terms: a library of 10 terms takes a tenth of a millisecond, 20 terms with all sizes a tenth of
-    a second. Source: Furnival & Wilson 1974, doi:10.1080/00401706.1974.10489231.
+    a second.
+
+    Source: Furnival & Wilson 1974, doi:10.1080/00401706.1974.10489231.
 
     Examples
     --------
