@@ -178,8 +178,10 @@ def refine(
         sum over windows w, samples k: |(x_w(t_k; c) - data_w,k) / std|^2
 
     where x_w is the integrated model. Each state is weighted by 1/std of its residuals in the last
-    passes (`n_reweights`). Assumes residuals of constant variance in each state. Source: Bock 1983,
-    doi:10.1007/978-1-4684-7324-7_7, for multiple shooting; the thesis, integral least squares.
+    passes (`n_reweights`). Assumes residuals of constant variance in each state.
+
+    Source: Bock 1983, doi:10.1007/978-1-4684-7324-7_7, for multiple shooting; the thesis, integral
+    least squares.
 
     Examples
     --------
