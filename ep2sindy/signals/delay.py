@@ -19,17 +19,39 @@ N_FILLING = 3.0
 
 @dataclass(frozen=True)
 class Delay:
-    """A state `delay_s` ago, followed through a chain of equal stages.
+    """A delayed state, followed through a chain of equal stages.
 
-    Stage k obeys x_k' = (x_(k-1) - x_k) n_stages / delay_s, where x_0 is the state itself. The last
-    stage is the state of some time ago, averaged over a gamma distribution of mean `delay_s` and
-    standard deviation delay_s / sqrt(n_stages): the more stages, the sharper the delay. Since the
-    stages are states, with equations that are known, a model with delayed terms is refined,
-    integrated and assessed like any other; its start says what the stages hold.
-    Raises ValueError for a delay that is not positive, or no stage.
+    Since the stages are states with known equations, a model with delayed terms is refined,
+    integrated and evaluated like any other. Its initial state states what the stages hold.
+
+    Parameters
+    ----------
+    state : str
+        Name of the state.
+    delay_s : float
+        Delay in s.
+    n_stages : int, default 4
+        Number of stages. The more stages, the sharper the delay.
+
+    Raises
+    ------
+    ValueError
+        If the delay is not positive, or there is no stage.
+
+    Notes
+    -----
+    Stage k obeys
+
+        x_k' = (x_(k-1) - x_k) n_stages / delay_s,   x_0 = the state itself
+
+    The last stage is the state of some time ago, averaged over a gamma distribution of mean
+    `delay_s` and standard deviation delay_s / sqrt(n_stages).
+
     Source of the "linear chain trick": MacDonald 1978, Time Lags in Biological Models,
     doi:10.1007/978-3-642-93107-9.
 
+    Examples
+    --------
     >>> delay = ep.signals.Delay("x", delay_s=2.0, n_stages=3)
     >>> delay.names
     ('x_lag1', 'x_lag2', 'x_lag3')

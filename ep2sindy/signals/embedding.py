@@ -270,10 +270,29 @@ def embed_alike(
 ) -> list[Embedded]:
     """Make states of the same signal of several runs, by one embedding.
 
-    Equations of one form can then hold for all. "auto" takes the growth rate if the signal is
-    positive in every run, and delays if noise drowns the derivative in one.
-    signals: as prepared. how, n_states, harmonics: see `embed`.
-    Raises ValueError for no signal.
+    Equations of one form can then hold for all.
+
+    Parameters
+    ----------
+    signals : sequence of Signal
+        Signals from `prepare_signal`.
+    how : str, default 'auto'
+        As for `ep.embed`. "auto" takes the growth rate if the signal is positive in every run, and
+        delays if noise hides the derivative in one.
+    n_states : int, default 2
+        Number of states in all.
+    harmonics : float, default HARMONICS
+        Number of harmonics of the period that the smoother follows.
+
+    Returns
+    -------
+    list of Embedded
+        The states along each run.
+
+    Raises
+    ------
+    ValueError
+        If there is no signal.
     """
     if not signals:
         raise ValueError("an embedding needs a signal or more, got an empty list")
