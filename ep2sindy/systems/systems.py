@@ -19,7 +19,18 @@ from ep2sindy.model.solve import solve_stages
 class System:
     """A known model, with the sampling that the thesis uses (appendix, II-E).
 
-    initial: (n_states,), the state at t = 0.
+    Parameters
+    ----------
+    name : str
+        Name of the system.
+    model : SparseModel
+        Its equations.
+    initial : (n_states,) array
+        State at t = 0.
+    duration_s : float
+        Length of a trajectory in s.
+    rate_Hz : float
+        Sampling rate in Hz.
     """
 
     name: str
@@ -35,9 +46,26 @@ class System:
         noise: float = 0.0,
         rng: np.random.Generator | int | None = None,
     ) -> Trajectory:
-        """Integrate with tolerance 1e-10, and add white noise of `noise` times each state's RMS.
+        """Integrate with tolerance 1e-10, and add white noise.
 
-        Raises ValueError for negative noise, or noise without an rng.
+        Parameters
+        ----------
+        initial : (n_states,) array, optional
+            State at t = 0. None takes that of the system.
+        noise : float, default 0.0
+            Standard deviation of the noise, as a fraction of each state's RMS.
+        rng : Generator or int, optional
+            Generator of the noise, or its seed.
+
+        Returns
+        -------
+        Trajectory
+            The samples.
+
+        Raises
+        ------
+        ValueError
+            If the noise is negative, or not zero without an rng.
         """
         if noise < 0.0 or (noise > 0.0 and rng is None):
             raise ValueError(
@@ -92,7 +120,27 @@ def _integrated(
 
 
 def damped_oscillator(*, zeta: float = 0.1, omega: float = 3.0) -> System:
-    """x' = v, v' = -2 zeta omega v - omega^2 x."""
+    """A linear oscillator with damping.
+
+    Parameters
+    ----------
+    zeta : float, default 0.1
+        Damping ratio.
+    omega : float, default 3.0
+        Angular frequency in rad/s.
+
+    Returns
+    -------
+    System
+        The model, with an initial state and a sampling.
+
+    Notes
+    -----
+    The equations are
+
+        x' = v
+        v' = -2 zeta omega v - omega^2 x
+    """
     equations = {"x": {"v": 1.0}, "v": {"x": -(omega**2), "v": -2.0 * zeta * omega}}
     return _system("damped oscillator", equations, 2, [1.0, 0.0], 30.0, 100.0)
 
@@ -136,7 +184,25 @@ def lotka_volterra(*, a: float = 2 / 3, b: float = 1.0, c: float = 1.0, d: float
 
 
 def van_der_pol(*, mu: float = 2.0) -> System:
-    """x' = mu (x - x^3/3 - y), y' = x / mu (Lienard form)."""
+    """The Van der Pol oscillator in the form of Lienard, a relaxation oscillation.
+
+    Parameters
+    ----------
+    mu : float, default 2.0
+        Strength of the nonlinear damping.
+
+    Returns
+    -------
+    System
+        The model, with an initial state and a sampling.
+
+    Notes
+    -----
+    The equations are
+
+        x' = mu (x - x^3/3 - y)
+        y' = x / mu
+    """
     equations = {"x": {"x": mu, "y": -mu, "x^3": -mu / 3.0}, "y": {"x": 1.0 / mu}}
     return _system("Van der Pol", equations, 3, [1.0, 1.0], 20.0, 50.0)
 
