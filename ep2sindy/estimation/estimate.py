@@ -201,7 +201,9 @@ def estimate(
     with the samples y, their noise sigma, and the flow F of the equations over one step. rho falls
     from 0.3 (relaxed states) to 1e-4 (an exact trajectory). The penalty of a term is that of
     `ep.discovery.Evidence`. Assumes independent, normal noise, white or correlated over some
-    samples. Source: de Jong 1991, doi:10.1214/aos/1176348139, for the filter; docs/estimation.md.
+    samples.
+
+    Source: de Jong 1991, doi:10.1214/aos/1176348139, for the filter; docs/estimation.md.
 
     Examples
     --------

@@ -176,7 +176,7 @@ def forecast(
     history : run
         Samples of the measured states and of the inputs. States of the model that it lacks are
         estimated from the others (`ep.model.estimate_states`).
-    horizon : float or array (samples,)
+    horizon : float or (samples,) array
         Duration in s, in steps of the history; or the times themselves, in s.
     fitted_to : run, optional
         The record that the model was fitted to, from which the noise is estimated. None takes the

@@ -123,7 +123,7 @@ def _with_its_code(function: Function, *packages: ModuleType) -> bytes:
 
 @dataclass(frozen=True)
 class Serial:
-    """Workers that compute one piece after the other, in this process."""
+    """Workers that compute one part after the other, in this process."""
 
     def run(self, function: Function, pieces: Iterable[Any]) -> Results:
         for numbered in enumerate(pieces):
@@ -137,7 +137,15 @@ ONE_BY_ONE = Serial()
 class Loky:
     """Workers in parallel processes on this machine.
 
-    n_jobs: their number; -1 for one per core.
+    Parameters
+    ----------
+    n_jobs : int, default -1
+        Number of processes. -1 means one per core.
+
+    Raises
+    ------
+    ValueError
+        If the number is zero or not whole.
     """
 
     n_jobs: int = -1
@@ -238,12 +246,23 @@ def run_alike(
 
 @dataclass(frozen=True)
 class Dask:
-    """Workers of a running dask scheduler, such as "tcp://10.0.0.1:8786".
+    """Workers of a running dask scheduler.
 
-    If a worker dies, its piece goes to another one, as often as the scheduler allows (three times
+    If a worker stops, its part goes to another one, as often as the scheduler allows (three times
     by default). Workers need this package, and must see the same files under the same paths. A
     function from another package is sent with its code. Needs the extra `cluster`.
-    Raises OSError if no scheduler with a worker answers at the address within `timeout_s`.
+
+    Parameters
+    ----------
+    address : str
+        Address of the scheduler, such as "tcp://10.0.0.1:8786".
+    timeout_s : float, default 10.0
+        Time in s that the scheduler has to answer.
+
+    Raises
+    ------
+    OSError
+        If no scheduler with a worker answers at the address in time.
     """
 
     address: str

@@ -118,9 +118,10 @@ class EBIC:
     the many terms of high degree. Assumes Gaussian residuals. Where the covariance of the rows is
     known (`Weak`), the residuals must be white after weighting by it. Where it is not
     (`Differential`), they must be independent from row to row; neighbouring rows of a smoothed
-    series are not, and too many terms are then selected. Source: Chen & Chen 2008,
-    doi:10.1093/biomet/asn034; Miller & Dunson 2019, doi:10.1080/01621459.2018.1469995; Schwarz
-    1978, doi:10.1214/aos/1176344136.
+    series are not, and too many terms are then selected.
+
+    Source: Chen & Chen 2008, doi:10.1093/biomet/asn034; Miller & Dunson 2019,
+    doi:10.1080/01621459.2018.1469995; Schwarz 1978, doi:10.1214/aos/1176344136.
 
     Examples
     --------
@@ -217,10 +218,23 @@ def _fit_all(
 
 @dataclass(frozen=True)
 class Evidence:
-    """Select by -2 log likelihood of the trajectories plus a complexity penalty.
+    """Select by -2 log likelihood of the trajectories plus a penalty for complexity.
 
     A `TrajectorySearch` ranks its own candidates by this value. Fronts of regressions do not have
     it.
+
+    Notes
+    -----
+    Minimises
+
+        -2 log L + sum over terms j of (log n + 2 log N_q + 2 log(2) (q - 1))
+
+    with the likelihood L, n samples, the degree q of term j (at least 1), and the number N_q of
+    terms up to that degree. Every degree above the first is half as likely a priori as the one
+    below.
+
+    Source: Schwarz 1978, doi:10.1214/aos/1176344136, for log n; Chen & Chen 2008,
+    doi:10.1093/biomet/asn034, for the count.
     """
 
     label: ClassVar[str] = "deviance"
@@ -261,8 +275,10 @@ class Knee:
     with e = 1 - R2. The linear scale assumes that a term worth having raises R2 by about one step
     of n_terms / n_norm: any other is dropped, by construction. The logarithmic scale assumes that
     errors span orders of magnitude: a true term that lowers the logarithm by less than one step of
-    the largest fall is dropped. Source: the thesis, Eq. 9; a corner of the curve of error and size,
-    as Hansen 1992, doi:10.1137/1034115, takes it for regularisation.
+    the largest fall is dropped.
+
+    Source: the thesis, Eq. 9; a corner of the curve of error and size, as Hansen 1992,
+    doi:10.1137/1034115, takes it for regularisation.
 
     Examples
     --------
