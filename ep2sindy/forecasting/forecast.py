@@ -212,9 +212,9 @@ def forecast(
     --------
     >>> system = ep.lotka_volterra()
     >>> run = system.trajectory(noise=0.02, rng=0)
-    >>> ahead = ep.forecast(system.model, run.window(0, 500), 2.0, n_draws=50)
+    >>> ahead = ep.forecast(system.model, run.window(0, 300), 2.0, n_draws=50)
     >>> low, high = ahead.band(0.9)
-    >>> inside = (low <= run.states[500:520]) & (run.states[500:520] <= high)
+    >>> inside = (low <= run.states[300:320]) & (run.states[300:320] <= high)
     >>> bool(0.8 < inside.mean() <= 1.0)
     True
     """

@@ -266,11 +266,11 @@ class SparseModel:
 
         Parameters
         ----------
-        t : array-like (samples,)
+        t : array_like (samples,)
             Times in s, increasing.
-        x0 : array-like (n_states,) or mapping of str to float
+        x0 : array_like (n_states,) or mapping of str to float
             State at t[0], in SI, in order or by name.
-        inputs : array-like (samples, n_inputs) or mapping, optional
+        inputs : array_like (samples, n_inputs) or mapping, optional
             Inputs at t, between which they follow the model's `courses`; or, by name, samples, a
             number, or a function of t in s.
         blow_up : float, default 1000000000000.0
@@ -320,10 +320,10 @@ class SparseModel:
 
         Parameters
         ----------
-        x : array-like (samples, n_states) or run
+        x : array_like (samples, n_states) or run
             States, or one sample (n_states,), or a Trajectory (or a table with a time column),
             which contains its own inputs.
-        inputs : array-like or mapping, optional
+        inputs : array_like or mapping, optional
             The same number of samples, in the order of `inputs`, or by name.
 
         Returns

@@ -91,6 +91,8 @@ class MultipleShooting:
     >>> system = ep.lotka_volterra()
     >>> method = ep.refinement.MultipleShooting(tolerance=1e-9)
     >>> refined = ep.refine(system.model, system.trajectory(noise=0.02, rng=0), method=method)
+    >>> str(refined.status)
+    'converged'
     """
 
     step: Step = ONE_RUNGE_KUTTA
