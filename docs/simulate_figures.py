@@ -1,6 +1,6 @@
-"""Draw the figures of docs/simulate.md by the commands that it names.
+"""Draw the figures of docs/thruster.md by the commands that it names.
 
-python docs/simulate_figures.py     # some minutes; prints what docs/simulate.md quotes
+python docs/simulate_figures.py     # some minutes; prints what docs/thruster.md quotes
 """
 
 from __future__ import annotations
@@ -12,13 +12,7 @@ from pathlib import Path
 
 DOCS = Path(__file__).resolve().parent
 ONE = ["+exp=simulate", "data.progress=false"]
-SCAN = [
-    "+exp=simulate",
-    "data.duration_s=3.0e-3",
-    "scan={operating_point.voltage:[150,200,250,300,350,400],"
-    "thruster.transport.c_plume:[0.008,0.011,0.0145,0.018]}",
-]
-FIGURES = {"maps": ONE, "profiles": ONE, "stability": SCAN}
+FIGURES = {"maps": ONE, "profiles": ONE}
 
 
 def main(overrides: list[str]) -> None:

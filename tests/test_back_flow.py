@@ -21,7 +21,7 @@ def test_where_ions_flow_back_a_law_is_found_that_is_sustained(tmp_path: Path) -
             f"output={tmp_path}",
         )
     ).summary
-    run = found["evaluations"]["simple_living"]
+    run = found["evaluations"]["simple_sustained"]
     assert run["status"] == "sustained"
     assert run["f_error"] == pytest.approx(0.0, abs=1e-3)
     balance = {(each["part"], each["term"]): each for each in found["terms_simple"]}

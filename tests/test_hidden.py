@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import ep2sindy as ep
-from ep2sindy.data.coerce import Task
+from ep2sindy.data.coerce import DiscoveryProblem
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import _hidden_names
 from ep2sindy.estimation import estimate, explanation
@@ -101,8 +101,6 @@ def test_the_experiment_finds_it_too(tmp_path) -> None:
     assert set(terms) == set(GROWTH)
     assert terms["x*g"] == pytest.approx(1.0, rel=1e-12)
     assert list(summary["samples_model"][0]["noise_std"]) == ["x"]
-    with pytest.raises(ValueError, match="one library and sustained=none"):
-        computed(composed("+exp=breathing", "+hidden=[g]", f"output={tmp_path}"))
 
 
 def test_a_hidden_state_that_shrinks_gains_no_freedom() -> None:
@@ -165,7 +163,7 @@ def test_only_positive_states_have_growth_rates_which_come_first() -> None:
     for shift, first, n_groups in ((0.0, "x*g", 2), (-1.0, "g", 1)):
         run = only("x")
         moved = Trajectory(run.t, run.states + shift, ["x"])
-        groups = list(with_guesses(Task([moved], library, hidden=["g"])))
+        groups = list(with_guesses(DiscoveryProblem([moved], library, hidden=["g"])))
         assert len(groups) == n_groups
         ((known, ways),) = groups[0]
         assert ways[0].term == first
@@ -186,7 +184,7 @@ def test_ways_are_followed_that_process_noise_explains(monkeypatch: pytest.Monke
     assert not ep.estimate(lorenz, library, hidden=["v", "h"]).lack_of_fit
     assert followed == [True]  # of three ways
     followed.clear()
-    assert ep.estimate(walk(lorenz.t), library, hidden=["v", "h"]).lack_of_fit
+    assert ep.estimate(walk(lorenz.t[:1200]), library, hidden=["v", "h"]).lack_of_fit
     assert followed
     assert not any(followed)
 
@@ -250,14 +248,9 @@ def test_what_was_not_measured_counts_nothing() -> None:
     ("call", "message"),
     [
         (lambda: ep.discover(only("x"), hidden=["x"]), "one that no run has, got .'x'. with"),
-        (lambda: ep.discover(only("x"), hidden=["g", "g"]), "'g'. with samples or twice"),
         (
             lambda: ep.discover(only("x"), method=ep.Regression(), hidden=["g"]),
             "a regression needs samples of every state",
-        ),
-        (
-            lambda: ep.model.estimate_states(ep.pendulum().model, only("x")),
-            "some of the model's states",
         ),
         (
             lambda: ep.model.estimate_states(ep.lorenz().model, only("z", system=ep.lorenz())),

@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 import ep2sindy as ep
 from ep2sindy.app import main as program
-from ep2sindy.data.coerce import Task
+from ep2sindy.data.coerce import DiscoveryProblem
 from ep2sindy.regression.front import Fronts
 from ep2sindy.runtime.progress import Progress
 from ep2sindy.runtime.threads import NUMBERS, one_thread
@@ -47,7 +47,7 @@ class WatchedChoice:
     basis: ClassVar[Basis] = "rows"
     seen: list[tuple[int, int]] = field(default_factory=list)
 
-    def decide(self, fronts: Fronts, task: Task, *, progress: Progress) -> Decision:
+    def decide(self, fronts: Fronts, task: DiscoveryProblem, *, progress: Progress) -> Decision:
         self.seen.append(threads())
         return ep.EBIC().decide(fronts, task, progress=progress)
 
@@ -56,6 +56,9 @@ def test_on_one_thread_and_then_on_as_many_as_before() -> None:
     assert threads() == (2, 2)
     with one_thread():
         assert threads() == (1, 1)
+    assert threads() == (2, 2)
+    with pytest.raises(ValueError, match="no"), one_thread():
+        raise ValueError("no")
     assert threads() == (2, 2)
 
 
@@ -66,12 +69,6 @@ def test_the_last_to_leave_gives_the_threads_back() -> None:
     first.__exit__(None, None, None)
     assert threads()[0] == 1
     second.__exit__(None, None, None)
-    assert threads() == (2, 2)
-
-
-def test_an_error_gives_the_threads_back() -> None:
-    with pytest.raises(ValueError, match="no"), one_thread():
-        raise ValueError("no")
     assert threads() == (2, 2)
 
 

@@ -65,10 +65,7 @@ def test_second_call_reads_identical_values(tmp_path, monkeypatch):
     ("one", "other"),
     [
         ({}, {"initial": ColdStart()}),
-        ({"initial": ColdStart()}, {"initial": ColdStart(n_i=4e17)}),
         ({"initial": SoftStart(hold_s=1e-5)}, {"initial": SoftStart(hold_s=2e-5)}),
-        ({}, {"averaged": False}),
-        ({}, {"thruster": Thruster(series_resistance=2.0)}),
         ({}, {"operating_point": OperatingPoint(300.0, 5.0, neutral_speed=281.0)}),
         ({}, {"n_cells": 41}),
     ],
@@ -100,13 +97,6 @@ def test_interrupted_write_leaves_nothing(tmp_path, monkeypatch):
     assert kept(tmp_path) == []
 
 
-def test_a_cache_that_cannot_be_written_costs_no_simulation(tmp_path, monkeypatch):
-    (tmp_path / "taken").write_text("a file")
-    monkeypatch.setattr(axial, "simulate_as", lambda *_, **__: pytest.fail("simulated in vain"))
-    with pytest.raises(OSError, match="taken could not be written .*make room there"):
-        simulate(Thruster(), POINT, cache=tmp_path / "taken", **BRIEF)
-
-
 def damaged(content: bytes) -> bytes:
     """One byte in the middle of the values changed."""
     middle = len(content) // 2
@@ -123,7 +113,6 @@ def other_parameters(content: bytes) -> bytes:
     [
         (damaged, "cannot be read"),
         (lambda content: content[:-9], "cannot be read"),
-        (lambda content: b"", "cannot be read"),
         (other_parameters, "it is of other parameters"),
     ],
 )

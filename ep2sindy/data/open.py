@@ -192,7 +192,7 @@ def _field(
 ) -> xr.Dataset:
     """Build the field that a mapping describes; one error reports all faults of the mapping."""
     if chunks is not None and find_spec("dask") is None:
-        raise ValueError("data.chunks needs dask: pip install 'ep2sindy[cluster]'")
+        raise ValueError("data.chunks needs dask: pip install 'ep2sindy[files]'")
     arrays: dict[str, xr.DataArray] = {}
     wanted = in_file(variables, problems)
     if not wanted and not problems.found:

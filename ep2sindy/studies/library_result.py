@@ -94,7 +94,7 @@ def add_evaluations(
     for name, result in results.items():
         if result.sustained is not None:
             runs |= {
-                f"{name}_living": result.sustained.run,
+                f"{name}_sustained": result.sustained.run,
                 f"{name}_refined": result.sustained.refined,
             }
         runs |= {name: result.runs[0]}
@@ -123,7 +123,7 @@ def add_tables(report: Report, results: Mapping[str, LibraryResult]) -> None:
     label = next(iter(results.values())).discovery.method.selection.label
     report.table("equations", ResultTable(rows, selected_metrics(label)), heading="of", shown=False)
     sustained = {
-        f"{name}_living": each.sustained for name, each in results.items() if each.sustained
+        f"{name}_sustained": each.sustained for name, each in results.items() if each.sustained
     }
     if sustained:
         report.table(
@@ -165,7 +165,7 @@ def find_best(results: Mapping[str, LibraryResult], n_records: int) -> Result:
     return found_model(
         f"Found with the library {best}",
         run,
-        file=f"{best}_living",
+        file=f"{best}_sustained",
         picture="trajectories" if run.cycle is None else f"free_run_{best}",
         more=[*words, *caution, *left_over_of_all(tests)],
         where="held-out time",

@@ -187,8 +187,8 @@ def add_sustained(report: Report, name: str, found: SustainedModel) -> None:
     """Add the model, how it runs, and how the choice of derivatives does; name: of the library."""
     model, clock, run = found.model, found.run.rollout.clock, found.run
     held_to = found.discovery.constraint
-    report.section(f"{name}: a model selected by free runs ({run.text})")
-    report.model(f"{name}_living", model, clock=clock, held=held_to, shown=False)
+    report.section(f"{name}: the model that free runs select ({run.text})")
+    report.model(f"{name}_sustained", model, clock=clock, held=held_to, shown=False)
     report.add(*model_blocks(model, clock, held=held_to, words=SPREAD, note=SPREAD_NOTE))
     if run.cycle is not None:
         period_s = run.cycle.period_s
@@ -197,7 +197,7 @@ def add_sustained(report: Report, name: str, found: SustainedModel) -> None:
     report.model(f"{name}_refined", found.refined.model, shown=False)
     report.add(*_notes(found))
     add_cycle(report, name, run)
-    add_samples(report, run.record, {f"{name}_living": run})
+    add_samples(report, run.record, {f"{name}_sustained": run})
     _add_others(report, name, found.discovery.others)
 
 
@@ -221,7 +221,7 @@ def _add_others(report: Report, name: str, others: Sequence[OtherSystem]) -> Non
     title = f"other models of as many coefficients that are sustained where not fitted{more}"
     rows = ResultTable(others[:MOST_OTHERS], OTHERS).screen()
     shown = Table(rows, title=title, note=OTHERS_NOTE, page_only=True)
-    report.table(f"living_others_{name}", ResultTable(others, OTHERS), shown=shown)
+    report.table(f"sustained_others_{name}", ResultTable(others, OTHERS), shown=shown)
 
 
 def _notes(found: SustainedModel) -> list[str]:
