@@ -2,11 +2,13 @@
 
 import ast
 import doctest
+import inspect
 import re
 import shlex
 import sys
 import tomllib
 from collections.abc import Iterator
+from enum import Enum
 from importlib.util import find_spec
 from pathlib import Path
 from shutil import which
@@ -322,3 +324,25 @@ def test_the_example_of_a_docstring_runs(name: str, here: Path) -> None:
     stated: list[str] = []
     doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(example, out=stated.append)
     assert not stated, "".join(stated)
+
+
+@pytest.mark.slow
+def test_a_docstring_describes_every_parameter() -> None:
+    """In its section `Parameters`, in any order; exceptions and enumerations have none."""
+    lost = []
+    for name, entry in dotted_names().items():
+        value = entry.load()
+        if not callable(value) or (isinstance(value, type) and issubclass(value, NO_PARAMETERS)):
+            continue
+        section = re.search(
+            r"^Parameters\n-+\n(.*?)(?=^\w+\n-+\n|\Z)", inspect.getdoc(value), SECTION
+        )
+        heads = re.findall(r"^(\S.*?) : ", section[1], re.MULTILINE) if section else []
+        stated = {each.lstrip("*") for head in heads for each in head.split(", ")}
+        if missing := set(inspect.signature(value).parameters) - stated:
+            lost.append(f"{name}: {sorted(missing)}")
+    assert not lost, "\n".join(lost)
+
+
+SECTION = re.MULTILINE | re.DOTALL
+NO_PARAMETERS = (Exception, Enum)

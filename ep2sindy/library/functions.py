@@ -222,14 +222,29 @@ def register_function(
 ) -> None:
     """Register a function of your own, so that terms can use it: `tanh(x)` or `tanh(2*x)`.
 
-    value, derivative: take a NumPy array and return an array of the same shape, element by element;
-    PyTorch needs nothing more.
-    domain: an open interval in which both are finite.
     Models store only the name, so register the function before you load one. Registering a name
     again replaces the function from then on.
-    Raises ValueError for a name that is not a plain word or is built in, a domain that is not an
-    interval, values of another shape or not finite, or a wrong derivative.
 
+    Parameters
+    ----------
+    name : str
+        A plain word that is not the name of a built-in function.
+    value : callable
+        Takes a NumPy array and returns an array of the same shape, element by element. PyTorch
+        needs nothing more.
+    derivative : callable
+        The derivative of `value`, in the same form.
+    domain : (float, float), default (-inf, inf)
+        Open interval in which both are finite.
+
+    Raises
+    ------
+    ValueError
+        If the name is not a plain word or is built in, the domain is not an interval, values have
+        another shape or are not finite, or the derivative is wrong.
+
+    Examples
+    --------
     >>> ep.register_function("tanh", np.tanh, lambda x: 1.0 - np.tanh(x) ** 2)
     >>> ep.polynomial(["x"], degree=1, functions=["tanh"]).names
     ('1', 'x', 'tanh(x)')

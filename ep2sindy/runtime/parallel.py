@@ -111,7 +111,7 @@ def _with_its_code(function: Function) -> bytes:
 
 @dataclass(frozen=True)
 class Serial:
-    """Workers that compute one piece after the other, in this process."""
+    """Workers that compute one part after the other, in this process."""
 
     def run(self, function: Function, pieces: Iterable[Any]) -> Results:
         for numbered in enumerate(pieces):
@@ -125,7 +125,15 @@ ONE_BY_ONE = Serial()
 class Loky:
     """Workers in parallel processes on this machine.
 
-    n_jobs: their number; -1 for one per core.
+    Parameters
+    ----------
+    n_jobs : int, default -1
+        Number of processes. -1 means one per core.
+
+    Raises
+    ------
+    ValueError
+        If the number is zero or not whole.
     """
 
     n_jobs: int = -1
