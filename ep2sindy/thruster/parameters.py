@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.data.readers.source import file_named
 from ep2sindy.thruster.checks import check_not_negative, check_positive, set_profile
 from ep2sindy.thruster.constants import K_BOLTZMANN
 from ep2sindy.thruster.magnetic_field import Field, MagneticField
 from ep2sindy.thruster.plume import Plume
 from ep2sindy.thruster.propellants import Propellant, XenonFits, gas_name
-from ep2sindy.thruster.tables import read_columns
 from ep2sindy.thruster.transport import (
     AnomalousTransport,
     FunctionTransport,
@@ -98,92 +95,10 @@ class ModulatedVoltage:
                 "; 0.05 is five per cent"
             )
 
-    def check(self, voltage: float, end_s: float) -> None:
-        """Nothing: it continues for ever, about any voltage."""
-
     def at(self, t: Volts, voltage: float) -> Volts:
         """Voltage in V at times in s, constant before t = 0."""
         phase = 2.0 * np.pi * self.frequency_Hz * np.maximum(t, 0.0)
         return voltage * (1.0 + self.fraction * np.sin(phase))
-
-
-@dataclass(frozen=True)
-class VoltageTable:
-    """Voltage of the supply at given times, linear between them.
-
-    Before t = 0, where the record begins, the voltage is that of t = 0, which must be the operating
-    point's.
-
-    Parameters
-    ----------
-    time : tuple of float
-        Times in s, increasing.
-    voltage : tuple of float
-        Voltages in V.
-
-    Raises
-    ------
-    ValueError
-        If there are gaps, times do not increase, the first time is above 0, or a voltage is not
-        positive.
-    """
-
-    time: tuple[float, ...]
-    voltage: tuple[float, ...]
-
-    def __post_init__(self) -> None:
-        set_profile(self, "time", "voltage", "V")
-        if self.time[0] > 0.0:
-            raise ValueError(
-                f"VoltageTable.time must begin at 0, where the record does, or before: it begins "
-                f"at {self.time[0]:g} s"
-            )
-
-    def check(self, voltage: float, end_s: float) -> None:
-        """Raise ValueError for another voltage at t = 0, or a table that ends before the run."""
-        first = float(self.at(np.zeros(1), voltage)[0])
-        if abs(first - voltage) > 1e-6 * voltage:
-            raise ValueError(
-                f"the operating point's voltage must be the supply's at t = 0: it is {voltage:g} V,"
-                f" and the table has {first:g} V; the warm-up is run at it"
-            )
-        if self.time[-1] < end_s:
-            raise ValueError(
-                f"the supply's voltage must be known to the end of the run, {end_s:g} s: the table "
-                f"ends at {self.time[-1]:g} s; lengthen it, or shorten duration_s"
-            )
-
-    def at(self, t: Volts, voltage: float) -> Volts:
-        """Voltage in V at times in s, constant before t = 0."""
-        return np.interp(np.maximum(t, 0.0), self.time, self.voltage)
-
-
-Supply = ModulatedVoltage | VoltageTable
-
-
-def read_voltage(path: str | Path) -> VoltageTable:
-    """Read a VoltageTable from a CSV file of two columns, time in s and voltage in V.
-
-    A first row without numbers is a header; lines that begin with # are ignored.
-
-    Parameters
-    ----------
-    path : str or Path
-        The file.
-
-    Returns
-    -------
-    VoltageTable
-        The table.
-
-    Raises
-    ------
-    ValueError
-        If there is a gap, or `VoltageTable` refuses the numbers.
-    """
-    _, columns = read_columns(Path(path), "file of a voltage", 2)
-    with file_named(Path(path)):
-        return VoltageTable(*columns)
 
 
 @dataclass(frozen=True)
@@ -460,7 +375,7 @@ class OperatingPoint:
     voltage: float  # V
     mass_flow_mg_s: float
     neutral_speed: float | NeutralSpeed = 338.0  # m/s, tuned
-    supply: Supply | None = None
+    supply: ModulatedVoltage | None = None
     background: Background | None = None
 
     def __post_init__(self) -> None:
