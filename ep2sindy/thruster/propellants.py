@@ -207,9 +207,10 @@ class PropellantTable:
         given = [(each.charge, each.higher) for each in self.further]
         needed = [pair for pair in FURTHER_IONIZATIONS if pair[1] <= self.charge_states]
         if sorted(given) != sorted(needed):
+            names = [FURTHER_IONIZATIONS[pair] for pair in needed]
             raise ValueError(
-                f"ions of charge {self.charge_states} of {self.name} need "
-                f"{[FURTHER_IONIZATIONS[pair] for pair in needed]}, each with its energy: got {given}"
+                f"ions of charge {self.charge_states} of {self.name} need {names}, each with its "
+                f"energy: got {given}"
             )
 
     @property
