@@ -13,7 +13,7 @@ from ep2sindy.app.schema import Configured, plain, study_of
 from ep2sindy.figures import breathing
 from ep2sindy.runtime.files import WriteError
 from ep2sindy.studies import points as studied
-from ep2sindy.studies.source import DivergedError, amiss, check_recorded, compile_kernels, doubts
+from ep2sindy.studies.source import DivergedError, amiss, check_recorded, doubts
 from tests import programs
 from tests.programs import summary_of
 
@@ -117,10 +117,10 @@ def test_a_place_that_the_config_leaves_to_its_default_can_be_changed() -> None:
     assert "transport" not in data.settings["thruster"]
 
 
-def test_kernels_are_compiled_without_a_trace(tmp_path: Path) -> None:
-    data = Configured(plain(composed(*toy(tmp_path)).data), "data")
-    compile_kernels([data.changed({"operating_point.voltage": v}) for v in (-5.0, 300.0)])
-    assert not (tmp_path / "cache").exists()
+def test_data_that_are_no_simulation_are_refused(predator_prey: Path, tmp_path: Path) -> None:
+    on_file = ["data=file", f"data.path={predator_prey}", f"output={tmp_path}"]
+    with pytest.raises(ValueError, match="data must be a simulation, .*open_field gave none; choo"):
+        run_config(composed(*on_file))
 
 
 def test_a_run_that_breaks_at_once_is_reported(tmp_path: Path) -> None:
