@@ -720,7 +720,7 @@ def test_process_noise_alone_is_no_law() -> None:
 def test_samples_that_leave_the_terms_open_are_reported_to_tell_nothing() -> None:
     found = ep.estimate(SHORT["60 samples, 20 %"](0), LORENZ.model.library)
     assert re.match(
-        r"60 samples do not tell these equations from others: the chance .* is \d+%",
+        r"60 samples do not tell these equations from others: the chance .* is \d+ %",
         found.too_few_samples,
     )
     assert found.note.startswith(found.too_few_samples)

@@ -48,6 +48,7 @@ from ep2sindy.studies.point_sources import (
     open_points,
 )
 from ep2sindy.studies.quantity_tables import Published, add_quantities, read_published
+from ep2sindy.studies.resume import resumed
 from ep2sindy.studies.source import Source
 from ep2sindy.studies.structures import Terms, terms_of
 from ep2sindy.studies.study import Count, Positive
@@ -133,21 +134,22 @@ class Study:
             report.say(f"{words}: {', '.join(self._given.left_out)}")
         self._report_known(report)
         sources = self._given.sources
-        inputs = self.source.inputs([self._given_models(self.models or {})[0]])
-        opened, signal = open_points(sources, inputs, workers=self.parallel, report=report), None
-        if self._is_signal:
-            opened, signal = embed_points(opened)
-        models = self.models or self._search(opened, signal, report)
-        library, given = self._given_models(models)
-        results = self._fit(opened, library, given, report)
-        records = records_of(opened, results, report)
-        try:
-            law = self._law(records, results, given, report)
-        except ValueError as error:
-            if not any(model.quantities for model in given.values()):
-                raise
-            law = None
-            report.warn(f"no law of whole models: {error}")
+        with resumed(self.keep, report, self.parallel) as workers:
+            inputs = self.source.inputs([self._given_models(self.models or {})[0]])
+            opened, signal = open_points(sources, inputs, workers=workers, report=report), None
+            if self._is_signal:
+                opened, signal = embed_points(opened)
+            models = self.models or self._search(opened, signal, report)
+            library, given = self._given_models(models)
+            results = self._fit(opened, library, given, workers, report)
+            records = records_of(opened, results, report)
+            try:
+                law = self._law(records, results, given, workers, report)
+            except ValueError as error:
+                if not any(model.quantities for model in given.values()):
+                    raise
+                law = None
+                report.warn(f"no law of whole models: {error}")
         self._report(report, results, records, library, given, law)
 
     def _fit(

@@ -361,7 +361,7 @@ class OperatingPoint:
         Anode flow in mg/s.
     neutral_speed : float or NeutralSpeed, default 338.0
         Speed of the neutrals in m/s, or its profile along the axis.
-    supply : ModulatedVoltage or VoltageTable, optional
+    supply : ModulatedVoltage, optional
         How the voltage varies in time. None means that it is constant.
     background : Background, optional
         The gas of the facility. None is a perfect vacuum.
