@@ -2,9 +2,9 @@
 
 On `thruster=lif`, whose ions flow back to the anode over much of the channel: structures of two
 densities, each refined as it is on three quarters of the record of every operating point, and run
-freely over the rest. `python -m benchmarks.sustained lif_law_back` has the one that lives on all
-splits, `lif_zones` and `lif_several` other zones, `python -m benchmarks.linear_criteria lif` the
-orders of each process. Prints a table of docs/living.md.
+freely over the rest. `python -m benchmarks.sustained lif_law_back` has the one that is sustained on
+all splits, `lif_zones` and `lif_several` other zones, `python -m benchmarks.linear_criteria lif`
+the orders of each process. Prints a table of docs/living.md.
 """
 
 from __future__ import annotations

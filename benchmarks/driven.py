@@ -193,8 +193,10 @@ class Oscillator:
     period: float
     is_positive: bool = False
 
-    def runs(self, pushes: float, noise: float, n_periods: int, seed: int) -> list[ep.Trajectory]:
-        """N_DRAWS noisy runs. pushes: random, of every state in a period, in its deviations."""
+    def runs(
+        self, process_noise: float, noise: float, n_periods: int, seed: int
+    ) -> list[ep.Trajectory]:
+        """N_DRAWS noisy runs. process_noise: of every state in a period, in its deviations."""
         rng, n_fine, n_first = np.random.default_rng(seed), 12, 20 * PER_PERIOD
         h = self.period / PER_PERIOD / n_fine
         x = np.array(self.start)[:, None] * rng.uniform(0.9, 1.1, (len(self.start), N_DRAWS))
@@ -203,7 +205,7 @@ class Oscillator:
             if k % n_fine == 0:
                 found.append(x)
             if k == n_first * n_fine // 2:
-                size = pushes * np.std(found[len(found) // 2 :], axis=(0, 2))[:, None]
+                size = process_noise * np.std(found[len(found) // 2 :], axis=(0, 2))[:, None]
             half = x + 0.5 * h * np.asarray(self.rates(x, k * h))
             x = x + h * np.asarray(self.rates(half, (k + 0.5) * h))
             x = x + size * np.sqrt(h / self.period) * rng.standard_normal(x.shape)
@@ -260,7 +262,7 @@ DRIVEN = {
     "Duffing": Oscillator(pushed_duffing, (0.5, 0.2), 4.137),
 }
 ROUND_HZ = 500.0
-PUSHES, LENGTHS = (0.0, 0.05, 0.15), (40, 150)
+PROCESS_NOISES, LENGTHS = (0.0, 0.05, 0.15), (40, 150)
 
 # Period in s, fraction of it at the upper level, rise time and relaxation time in periods, noise.
 SQUARES = [
@@ -356,21 +358,27 @@ def questions() -> None:
         ]
         shape = f"duty {duty}, rise {rise}, relaxation {lag}"
         tell(f"square wave, {period_s:g} s, {shape}, {100 * noise:.0f} % noise", runs)
-    for (name, case), pushes, n in product(DRIVEN.items(), PUSHES, LENGTHS):
+    for (name, case), process_noise, n in product(DRIVEN.items(), PROCESS_NOISES, LENGTHS):
         runs = [
             ep.Trajectory(run.t / case.period / any_frequency(rng), run.columns(["x"]), ["x"])
-            for run, rng in zip(case.runs(pushes, 0.02, n, seed=0), generators(), strict=True)
+            for run, rng in zip(
+                case.runs(process_noise, 0.02, n, seed=0), generators(), strict=True
+            )
         ]
-        tell(f"{name}, any frequency, pushes of {100 * pushes:.0f} %, {n} periods", runs)
+        tell(
+            f"{name}, any frequency, process noise of {100 * process_noise:.0f} %, {n} periods",
+            runs,
+        )
     print("self-sustained, asked falsely | columns next to | none")
-    for (name, case), pushes, n in product(SELF_SUSTAINED.items(), PUSHES, LENGTHS):
-        made = case.runs(pushes, 0.02, n, seed=0)
+    for (name, case), process_noise, n in product(SELF_SUSTAINED.items(), PROCESS_NOISES, LENGTHS):
+        made = case.runs(process_noise, 0.02, n, seed=0)
         for round_ in (False, True):
             runs = [
                 at_frequency(run, ROUND_HZ if round_ else any_frequency(rng))
                 for run, rng in zip(made, generators(), strict=True)
             ]
-            how = f"{'500 Hz' if round_ else 'any frequency'}, pushes of {100 * pushes:.0f} %"
+            how = "500 Hz" if round_ else "any frequency"
+            how = f"{how}, process noise of {100 * process_noise:.0f} %"
             tell(f"{name}, {how}, {n} periods", runs)
 
 

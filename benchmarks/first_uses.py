@@ -95,7 +95,7 @@ def populations() -> None:
 def with_process_noise(
     rates: Callable[[np.ndarray], np.ndarray], n: int, step: float
 ) -> ep.Trajectory:
-    """Simulated counts: n of two species, pushed by 10 % in a unit of time, counted to 5 %."""
+    """Simulated counts: n of two species, 10 % process noise a time unit, counted to 5 %."""
     rng, x, h, states = np.random.default_rng(0), np.array([0.5, 0.3]), step / 100, []
     for k in range(100 * (n + 50)):
         if k >= 5000 and k % 100 == 0:

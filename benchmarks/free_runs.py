@@ -34,7 +34,7 @@ def run(rates: Callable, t: np.ndarray, y: np.ndarray, rtol: float) -> Integrati
 
 
 def equations(system: ep.systems.System, drive: Curve) -> Driven:
-    """Of a system; a driven one is pushed by its first input in its first state."""
+    """Of a system; a driven one has its first input in its first state."""
     field, n = system.model.field, len(system.model.states)
     if drive.pieces.shape[2]:
         library = field.library.over([*system.model.states, "u"])

@@ -139,7 +139,7 @@ def is_true(forecast: dict[str, Any]) -> str:
 class Record:
     """A record of one signal. unit: of its times. driven: whether something else moves it.
 
-    lives: whether it repeats one cycle, so that a model of it may be reported to sustain it.
+    is_sustained: whether it repeats one cycle, so that a model of it may be reported to sustain it.
     """
 
     name: str

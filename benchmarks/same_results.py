@@ -69,8 +69,8 @@ TOYS: dict[str, list[str]] = {
     ],
     "predict": [
         "+exp=predict", "data.cache={cache}", "data.duration_s=2.0e-3", "data.warm_up_s=1.0e-3",
-        "data.n_cells=30", "parallel=serial", "law=1", "windows.n_windows=4",
-        "windows.periods=1.0", "map_points=3",
+        "data.n_cells=30", "parallel=serial", "law=1",
+        "windows={{n_windows: 4, periods: 1.0}}", "map_points=3",
         "points=[{{V_D_V: [280.0, 300.0, 320.0], mdot_mg_s: [5.0, 5.5]}}]",
     ],
     "pointwise": [

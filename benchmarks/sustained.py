@@ -4,9 +4,9 @@ Equations that conserve what ions and neutrals of the whole channel exchange, as
 finds them: over operating points, splits of the record and seeds, on the default source, on the
 former one, and on `thruster=lif`, whose ions flow back (`lif`, `lif_law_back`, and with 200 cells
 `lif_law_back_fine`); next to free terms, in other zones, in several at once (`several`, `three`),
-in noise, and from the (z, r) simulator. Every model called self-sustained is run again by another solver,
-ten times as long; its processes are compared with the balance of the zone. Prints the tables of
-docs/living.md, or those that are named.
+in noise, and from the (z, r) simulator. Every model called self-sustained is run again by another
+solver, ten times as long; its processes are compared with the balance of the zone. Prints the
+tables of docs/living.md, or those that are named.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ from itertools import product
 import numpy as np
 import pandas as pd
 
-from ep2sindy.data.coerce import Task
+from ep2sindy.data.coerce import DiscoveryProblem
 from ep2sindy.regression.bootstraps import Bootstraps, pool_supports
 from ep2sindy.regression.formulations import WeightedWeak
 from ep2sindy.regression.front import ParetoFront, pareto_front
@@ -56,7 +56,7 @@ def assessed(number: int, *, name: str, noise: float, rules: Sequence[str]) -> d
     row = {"on the front": float(there)}
     for rule in rules if there else ():
         begin = time.process_time()
-        scores = RULES[rule].decide(fronts, Task(runs, system.model.library)).scores
+        scores = RULES[rule].decide(fronts, DiscoveryProblem(runs, system.model.library)).scores
         row[f"{rule}, s"] = time.process_time() - begin
         chosen = [set(f.with_scores(s).best.terms) for f, s in zip(fronts, scores, strict=True)]
         row[rule] = float(chosen == truth)

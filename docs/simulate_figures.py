@@ -1,6 +1,6 @@
-"""Draw the figures of docs/simulate.md by the commands that it names.
+"""Draw the figures of docs/thruster.md by the commands that it names.
 
-python docs/simulate_figures.py     # some minutes; prints what docs/simulate.md quotes
+python docs/simulate_figures.py     # some minutes; prints what docs/thruster.md quotes
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
-from ep2sindy.data.coerce import Task
+from ep2sindy.data.coerce import DiscoveryProblem
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.regression.front import ParetoFront
 from ep2sindy.runtime.progress import SILENT, Progress
@@ -20,7 +20,7 @@ class BySize:
     basis: ClassVar[Basis] = "runs"
 
     def decide(
-        self, fronts: Sequence[ParetoFront], task: Task, *, progress: Progress = SILENT
+        self, fronts: Sequence[ParetoFront], task: DiscoveryProblem, *, progress: Progress = SILENT
     ) -> Decision:
         scores = [self.sign * front.sizes for front in fronts]
         best = [front.with_scores(s).best for front, s in zip(fronts, scores, strict=True)]

@@ -6,7 +6,7 @@ from itertools import islice, product
 import numpy as np
 import pytest
 
-from ep2sindy.data.coerce import Task
+from ep2sindy.data.coerce import DiscoveryProblem
 from ep2sindy.discovery.method import Regression
 from ep2sindy.library.library import polynomial
 from ep2sindy.library.relations import relations_of
@@ -66,7 +66,7 @@ def test_a_cap_keeps_the_true_terms_after_a_regression(formulation: Weak | Weigh
     run = system.trajectory(noise=0.02, rng=0).window(0, 1000)
     search = BestSubset(max_terms=5, n_best=3)
     method = Regression(formulation, search, depth=3)
-    task = Task([run], polynomial(run.state_names, degree=2))
+    task = DiscoveryProblem([run], polynomial(run.state_names, degree=2))
     fronts = [each.front for each in method.search_equations(task, rng=0)]
     assert all(front.held_out == isinstance(formulation, Weak) for front in fronts)
     (first,) = combinations(fronts, 1)

@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ep2sindy.data.coerce import Task
+from ep2sindy.data.coerce import DiscoveryProblem
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.datasets.records import hare_lynx
 from ep2sindy.discovery import choice
@@ -173,7 +173,7 @@ def test_the_free_coefficients_of_related_equations_are_counted(
 ) -> None:
     run, library = lotka_volterra().trajectory(), named_terms(["x", "y"], ["x", "y", "x*y"])
     terms = {"x": ["x", "x*y"], "y": ["y", "x*y"]}
-    task = Task([run], library.relate(*relations).only(terms))
+    task = DiscoveryProblem([run], library.relate(*relations).only(terms))
     found = Regression().identify(task, rng=np.random.default_rng(0))
     assert found.noise_test.n_free == n_free
 

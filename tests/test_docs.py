@@ -121,8 +121,8 @@ def check_config(config: str, page: str) -> str:
 
 @pytest.mark.slow
 def test_the_config_of_a_study_of_ones_own_runs(here: Path) -> None:
-    """That of docs/parametric.md, on short, coarse simulations."""
-    (config,) = (b.text for b in blocks(ROOT / "docs" / "parametric.md") if b.language == "yaml")
+    """That of docs/points.md, on short, coarse simulations."""
+    (config,) = (b.text for b in blocks(ROOT / "docs" / "points.md") if b.language == "yaml")
     own = composed_with(
         "exp", "my_study", config, "+exp=my_study", "data.duration_s=2.0e-3",
         "data.warm_up_s=0.5e-3", "data.n_cells=30", "data.cache=simulated", "parallel=serial",

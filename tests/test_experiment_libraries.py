@@ -112,9 +112,9 @@ def test_the_page_says_the_model_that_is_sustained_before_candidates(breathing_r
     assert "the cycle is neutral: it neither attracts nor repels" in found
     assert 'id="figure-free_run_simple"' in found
     order = [
-        "How the models run", "simple: a model selected by free runs (sustained)",
-        "simple: what the terms mean", "simple: forecasts over time held out",
-        "The selected models", "simple: candidates", "ionization: candidates",
+        "How the models run", "simple: the model that free runs select (sustained)",
+        "simple: terms as physical processes", "simple: forecasts over time held out",
+        "The selected models", "simple: candidate equations", "ionization: candidate equations",
     ]  # fmt: skip
     titles = re.findall(r"<h[23][^>]*>(.*?)</h", rest)
     assert [title for title in titles if title in order] == order

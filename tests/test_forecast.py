@@ -23,7 +23,7 @@ DRIVEN = model_of({"x": {"v": 1.0}, "v": {"x": -1.0, "v": -0.3, "u": 1.0}}, ["u"
 
 @cache
 def spring(noise: float, *, momentum_gain: float = 0.0, n: int = 1200, seed: int = 0) -> Trajectory:
-    """The exact spring, at steps of 0.1 s, whose speed is pushed at random at every step."""
+    """The exact spring, at steps of 0.1 s, with process noise of the speed at every step."""
     rng, h = np.random.default_rng(seed), 0.1
     turn = np.array([[np.cos(h), np.sin(h)], [-np.sin(h), np.cos(h)]])
     states = [np.array([1.0, 0.0])]
@@ -55,7 +55,7 @@ def test_a_start_is_the_kalman_filter_of_the_window() -> None:
         [np.column_stack([np.cos(age), -np.sin(age)]), np.column_stack([np.sin(age), np.cos(age)])]
     ).reshape(2 * n, 2)
     fit = np.linalg.lstsq(rows, run.states[800 - n : 800].T.ravel(), rcond=None)[0]
-    assert end.mean == pytest.approx(fit, abs=2e-3)  # pushes are small, and not nothing
+    assert end.mean == pytest.approx(fit, abs=2e-3)  # the process noise is small, not zero
     expected = np.sqrt(np.diag(np.linalg.inv(rows.T @ rows))) * estimator.noise.samples
     assert np.sqrt(np.diag(end.covariance)) == pytest.approx(expected, rel=0.1)
 
@@ -100,7 +100,7 @@ def test_bands_grow_where_the_record_is_moved_by_process_noise() -> None:
     held = [
         ep.model.forecast_skill(SPRING, run, n_fitted=900, starts=30).coverage_90 for run in runs
     ]
-    assert 0.82 <= np.mean(held) <= 0.97  # 300 samples are few when pushes last
+    assert 0.82 <= np.mean(held) <= 0.97  # 300 samples are few where process noise lasts
 
 
 def driven_spring(n: int = 1200) -> Trajectory:

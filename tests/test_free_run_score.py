@@ -10,7 +10,7 @@ import pytest
 import ep2sindy as ep
 from ep2sindy.library.relations import binding, complete, parse_relation
 from ep2sindy.model.stability import limit_cycle
-from ep2sindy.selection.systems import Confirmed, Trial, find_sustained, folds, list_others
+from ep2sindy.selection.systems import ConfirmedSystem, Trial, find_sustained, folds, list_others
 from tests.models import model_of
 
 PREY = replace(ep.lotka_volterra(), rate_Hz=5.0)  # 69 samples a period
@@ -67,7 +67,7 @@ def test_noise_is_no_obstacle():
     # On the data's cycle; from one sample its phase may be off by more than a first period allows.
     assert assessed.status in (ep.model.Status.SUSTAINED, ep.model.Status.WRONG_FREQUENCY)
     assert abs(assessed.f_error) < 0.01
-    # It lives, and yet it is not the truth: it leaves more than noise, and has no intervals.
+    # It is sustained, and yet it is not the truth: it leaves more than noise, and has no intervals.
     assert noisy.lack_of_fit
     assert noisy.model.covariance is None
 
@@ -238,7 +238,7 @@ def confirmed(
     """A system as the rule has confirmed it, with these figures."""
     held = SimpleNamespace(n_free=n_free)
     run = SimpleNamespace(rank=(not is_sustained, 0))
-    return Confirmed(
+    return ConfirmedSystem(
         Trial(held, 0.3, 0.0, 0.0, waveform, loss), None, broken, fraction, run, repels
     )
 

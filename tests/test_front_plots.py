@@ -7,7 +7,7 @@ import pytest
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
-from ep2sindy.data.coerce import Task
+from ep2sindy.data.coerce import DiscoveryProblem
 from ep2sindy.discovery.method import Regression
 from ep2sindy.figures.fronts import FLOOR, TOP, front_figure
 from ep2sindy.regression.bootstraps import Bootstraps
@@ -27,7 +27,7 @@ def searched() -> Searched:
     recipe = Regression(
         Differential(), BestSubset(max_terms=4), bootstraps=Bootstraps(n=12), depth=3
     )
-    equation = recipe.search_equations(Task([run], system.model.library), rng=0)[0]
+    equation = recipe.search_equations(DiscoveryProblem([run], system.model.library), rng=0)[0]
     return equation.front, equation.supports.masks
 
 

@@ -92,7 +92,7 @@ def test_a_derivative_takes_no_samples_from_beyond_a_gap() -> None:
 def test_the_noise_that_a_tracker_finds_does_not_know_of_a_gap() -> None:
     whole, gappy = (tune_estimator(LV, run).noise for run in (WHOLE, GAPPY))
     assert gappy.samples == pytest.approx(whole.samples, rel=0.15)
-    # A step across the gap would need pushes as large as the states.
+    # A step across the gap would need process noise as large as the states.
     assert (gappy.process < 0.02 * WHOLE.states.std(axis=0)).all()
 
 

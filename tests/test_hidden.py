@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import ep2sindy as ep
-from ep2sindy.data.coerce import Task
+from ep2sindy.data.coerce import DiscoveryProblem
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import _hidden_names
 from ep2sindy.estimation import estimate, explanation
@@ -165,7 +165,7 @@ def test_only_positive_states_have_growth_rates_which_come_first() -> None:
     for shift, first, n_groups in ((0.0, "x*g", 2), (-1.0, "g", 1)):
         run = only("x")
         moved = Trajectory(run.t, run.states + shift, ["x"])
-        groups = list(with_guesses(Task([moved], library, hidden=["g"])))
+        groups = list(with_guesses(DiscoveryProblem([moved], library, hidden=["g"])))
         assert len(groups) == n_groups
         ((known, ways),) = groups[0]
         assert ways[0].term == first

@@ -98,9 +98,8 @@ def test_a_point_is_what_discover_finds_there(formulation: object) -> None:
     search = searching(formulation=formulation, search=ep.AdaptiveLasso(), bootstraps=draws)
     field = noisy()
     result = ep.pointwise(field, search, workers=Serial()).isel(z=2, r=1)
-    run = ep.data.point_samples(
-        field.isel(z=[2], r=[1]), z=Z[2], r=R[1], states=["x"], inputs=["u", "w"]
-    )
+    place = ep.Zone(z=Z[2], r=R[1])
+    run = ep.zone_average(field, place, states=["x"], inputs=["u", "w"])
     found = ep.discover([run], LIBRARY, search.method, seed=search.seed)
     np.testing.assert_allclose(result["coef"].sel(equation="x"), found.model.coef[:, 0], rtol=1e-12)
     chosen = found.chosen["x"]

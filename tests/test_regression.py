@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import ep2sindy as ep
-from ep2sindy.data.coerce import Task
+from ep2sindy.data.coerce import DiscoveryProblem
 from ep2sindy.regression import formulations, rows
 from ep2sindy.regression.ambiguity import ambiguities, few_rows, row_limit, usable_terms
 from ep2sindy.regression.bootstraps import pool_supports
@@ -171,10 +171,12 @@ def test_a_long_record_in_blocks_gives_the_same_regression(monkeypatch: pytest.M
     runs = [ep.lorenz().trajectory(noise=0.05, rng=k).window(0, 700) for k in range(2)]
     library = ep.lorenz().model.library
     method = ep.Regression(ep.Differential(), ep.BestSubset(), bootstraps=ep.Bootstraps(n=4))
-    whole = method.search_equations(Task(runs, library), rng=0)
+    whole = method.search_equations(DiscoveryProblem(runs, library), rng=0)
     for module in (rows, formulations):
         monkeypatch.setattr(module, "MOST_ROWS", 300)
-    for one, other in zip(whole, method.search_equations(Task(runs, library), rng=0), strict=True):
+    for one, other in zip(
+        whole, method.search_equations(DiscoveryProblem(runs, library), rng=0), strict=True
+    ):
         assert "train_columns" not in vars(other.front.rows)  # no scaled copy of all rows was made
         assert isinstance(other.front.rows.theta, rows.TermsAt)  # nor were all terms held
         assert one.supports.masks.tolist() == other.supports.masks.tolist()

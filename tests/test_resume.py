@@ -12,7 +12,7 @@ from omegaconf import DictConfig
 
 import ep2sindy as ep
 from ep2sindy.runtime import parallel
-from ep2sindy.runtime.parallel import KeptWorkers, Loky, Serial
+from ep2sindy.runtime.parallel import CachedWorkers, Loky, Serial
 from ep2sindy.runtime.user_cache import cache_folder
 from ep2sindy.studies import benchmark, trace
 from tests.programs import Computed, composed, computed
@@ -28,7 +28,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "cache"
 
 
-def squares_and_negatives(workers: KeptWorkers, done: list[int]) -> list[list[tuple[int, Any]]]:
+def squares_and_negatives(workers: CachedWorkers, done: list[int]) -> list[list[tuple[int, Any]]]:
     def square(n: int) -> np.ndarray:
         done.append(n)
         if n == 5 and len(done) == 3:
@@ -41,34 +41,34 @@ def squares_and_negatives(workers: KeptWorkers, done: list[int]) -> list[list[tu
 def test_pieces_are_computed_once_over_all_calls(tmp_path: Path) -> None:
     done: list[int] = []
     with pytest.raises(KeyboardInterrupt):
-        squares_and_negatives(KeptWorkers(Serial(), tmp_path / "a"), done)
+        squares_and_negatives(CachedWorkers(Serial(), tmp_path / "a"), done)
     for _ in range(2):
-        found = squares_and_negatives(KeptWorkers(Serial(), tmp_path / "a"), done)
+        found = squares_and_negatives(CachedWorkers(Serial(), tmp_path / "a"), done)
         assert found == [[(0, 9), (1, 16), (2, 25)], [(0, -1), (1, -2)]]
     assert done == [3, 4, 5, 5]
-    squares_and_negatives(KeptWorkers(Serial(), tmp_path / "b"), done)
-    squares_and_negatives(KeptWorkers(Serial(), None), done)
+    squares_and_negatives(CachedWorkers(Serial(), tmp_path / "b"), done)
+    squares_and_negatives(CachedWorkers(Serial(), None), done)
     assert len(done) == 10
 
 
 def test_workers_in_other_processes_share_the_pieces(tmp_path: Path) -> None:
-    first = sorted(KeptWorkers(Loky(2), tmp_path).run(lambda n: (n, os.getpid()), [1, 2]))
-    assert sorted(KeptWorkers(Serial(), tmp_path).run(lambda n: (n, 0), [1, 2])) == first
+    first = sorted(CachedWorkers(Loky(2), tmp_path).run(lambda n: (n, os.getpid()), [1, 2]))
+    assert sorted(CachedWorkers(Serial(), tmp_path).run(lambda n: (n, 0), [1, 2])) == first
     assert all(process != os.getpid() for _, (_, process) in first)
 
 
 def test_a_discovery_is_read_back_bit_for_bit(tmp_path: Path) -> None:
     run = ep.lotka_volterra().trajectory(noise=0.01, rng=0)
-    found, back = (KeptWorkers(Serial(), tmp_path).once(lambda: ep.discover(run)) for _ in "ab")
+    found, back = (CachedWorkers(Serial(), tmp_path).once(lambda: ep.discover(run)) for _ in "ab")
     assert repr(back) == repr(found)
     assert back.model.coef.tobytes() == found.model.coef.tobytes()
 
 
 def test_a_damaged_piece_is_computed_again(tmp_path: Path) -> None:
-    assert KeptWorkers(Serial(), tmp_path).once(lambda: 7) == 7
+    assert CachedWorkers(Serial(), tmp_path).once(lambda: 7) == 7
     (stored,) = tmp_path.rglob("output.pkl")
     stored.write_bytes(b"cut")
-    assert KeptWorkers(Serial(), tmp_path).once(lambda: 8) == 8
+    assert CachedWorkers(Serial(), tmp_path).once(lambda: 8) == 8
 
 
 def test_pieces_of_a_run_that_nobody_took_up_are_removed(cache: Path) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import ep2sindy as ep
-from ep2sindy.data.coerce import Task
+from ep2sindy.data.coerce import DiscoveryProblem
 from ep2sindy.library.roles import constraint_of, process_amounts
 from ep2sindy.selection.conserving import search_conserving_systems
 from ep2sindy.selection.systems import TrialSystem
@@ -132,7 +132,7 @@ def test_a_search_by_mass_action_proposes_positive_processes_alone(record):
     found = ep.discover(record, LIBRARY.with_roles(MASS_ACTION), method)
     assert found.model.terms("n_i") == pytest.approx({"n_i": -A, "n_n": S, "n_i*n_n": R}, rel=1e-3)
     rows = ep.Differential().assemble([record], LIBRARY, rng=np.random.default_rng(0))
-    task = Task([record], LIBRARY)
+    task = DiscoveryProblem([record], LIBRARY)
     systems = search_conserving_systems(rows, task, MASS_ACTION, method.search, depth=50).systems
     assert len(systems) > 4
     assert not any(system.broken(system.model) for system in systems)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import ep2sindy as ep
-from ep2sindy.data.coerce import Task
+from ep2sindy.data.coerce import DiscoveryProblem
 from ep2sindy.discovery.result import DiscoveryMethod
 from ep2sindy.runtime.values import check_kind
 
@@ -57,7 +57,7 @@ def test_an_estimate_takes_runs_and_relations_as_discover_does() -> None:
 
 def test_a_task_keeps_its_values_and_takes_a_tuple_of_runs() -> None:
     terms = {"x": ["x", "x*y"]}
-    task = Task([RUN, OTHER], LIBRARY.relate("y: y == 1").only(terms))
+    task = DiscoveryProblem([RUN, OTHER], LIBRARY.relate("y: y == 1").only(terms))
     terms["x"].append("y")
     assert task.states == ("x", "y")
     assert task.facts.only == {"x": ("x", "x*y")}

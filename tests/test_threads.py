@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 import ep2sindy as ep
 from ep2sindy.app import main as program
-from ep2sindy.data.coerce import Task
+from ep2sindy.data.coerce import DiscoveryProblem
 from ep2sindy.regression.front import Fronts
 from ep2sindy.runtime.progress import Progress
 from ep2sindy.runtime.threads import NUMBERS, one_thread
@@ -47,7 +47,7 @@ class WatchedChoice:
     basis: ClassVar[Basis] = "rows"
     seen: list[tuple[int, int]] = field(default_factory=list)
 
-    def decide(self, fronts: Fronts, task: Task, *, progress: Progress) -> Decision:
+    def decide(self, fronts: Fronts, task: DiscoveryProblem, *, progress: Progress) -> Decision:
         self.seen.append(threads())
         return ep.EBIC().decide(fronts, task, progress=progress)
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import ep2sindy as ep
-from ep2sindy.data.coerce import Task
+from ep2sindy.data.coerce import DiscoveryProblem
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.ode import unconstrained
 from ep2sindy.refinement.refine import BatchRefinement, refine_batch, smooth_batch
@@ -51,7 +51,7 @@ def fronts_of(
 
 def scores_by(rule: ep.FreeRunScore, fronts: list[ParetoFront]) -> list[np.ndarray]:
     rows = fronts[0].rows
-    return list(rule.decide(fronts, Task(rows.trajectories, rows.library)).scores)
+    return list(rule.decide(fronts, DiscoveryProblem(rows.trajectories, rows.library)).scores)
 
 
 def picked(rule: ep.FreeRunScore, fronts: list[ParetoFront]) -> list[set[str]]:

@@ -1,8 +1,8 @@
 """Checks of the trajectories that come in.
 
 They look for samples outside the domain of a library's functions, for states that repeat
-another state, and for samples that two runs share. A `Task` is what a method is asked: trajectories
-that agree, and a library with what is known of the equations.
+another state, and for samples that two runs share. A `DiscoveryProblem` is what a method is asked:
+trajectories that agree, and a library with what is known of the equations.
 """
 
 from __future__ import annotations
@@ -165,7 +165,7 @@ def _common_start(first: Float[np.ndarray, "n d"], second: Float[np.ndarray, "m 
 
 
 @dataclass(frozen=True, eq=False)
-class Task:
+class DiscoveryProblem:
     """What a method is asked: equations of these runs, from this library, with what it knows.
 
     runs: trajectories of the same states, which agree in the units of the library's variables.

@@ -165,7 +165,7 @@ def list_arrays(source: FileSource) -> str:
 # Summary of an array.
 
 
-MIN_GAP = 3.0  # steps; a shorter one may be a sample that came late
+MIN_GAP = 3.0  # steps; a shorter one may be a delayed sample
 
 TEXT = "text or objects"  # problem of arrays that are not numbers
 

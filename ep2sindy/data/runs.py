@@ -173,7 +173,7 @@ def _from_field(field: xr.Dataset, partial: bool) -> Trajectory:
         raise ValueError(
             "a Dataset must have the dimension time alone to be a run, got "
             f"{list(map(str, field.dims))}; average over a zone, ep.zone_average(field, "
-            "ep.Zone(), states=[...]), or take a point, ep.data.point_samples(field, ...)"
+            "ep.Zone(), states=[...]), or at a point, ep.Zone(z=PLACE)"
         )
     if "time" not in field.coords:
         raise ValueError(

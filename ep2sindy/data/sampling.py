@@ -8,12 +8,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
-from typing import ClassVar
 
 import numpy as np
 import xarray as xr
 
-from ep2sindy.data.fields import SPACE, cell_edges, cell_sizes, grid_points
+from ep2sindy.data.fields import cell_edges, cell_sizes, grid_points
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.data.zones import Zone, describe_zone, resolve_zone, zone_average, zone_slices
 
@@ -57,8 +56,9 @@ def side_by_side(zones: Mapping[str, Zone | Sequence[float]], field: xr.Dataset)
         if not re.fullmatch(r"\w{1,100}", str(name)):
             raise ValueError(f"a zone's name must be a word, such as 'exit', got {name!r}")
         zone = resolve_zone(given if isinstance(given, Zone) else Zone(z=given), field)
-        begin_m, end_m = map(float, zone.z or (-math.inf, math.inf))
-        if begin_m < reached_m or zone.z is None:
+        is_part = isinstance(zone.z, tuple)
+        begin_m, end_m = zone.z if isinstance(zone.z, tuple) else (-math.inf, math.inf)
+        if begin_m < reached_m or not is_part:
             raise ValueError(
                 "zones must follow each other in z without overlap, each with its ends in m: "
                 f"{name} is {zone.z}"
@@ -108,7 +108,10 @@ class ZoneAverage:
         whole = resolve_zone(self.zone, field)
         if self.zones is None:
             return {"": whole}
-        begin_m, end_m = map(float, whole.z or cell_edges(grid_points(field, "z"))[[0, -1]])
+        ends = (
+            whole.z if isinstance(whole.z, tuple) else cell_edges(grid_points(field, "z"))[[0, -1]]
+        )
+        begin_m, end_m = map(float, ends)
         edges_m = np.linspace(begin_m, end_m, self.zones + 1)
         cut = {n: replace(whole, z=z) for n, z in zip(self._names, pairwise(edges_m), strict=True)}
         return side_by_side(cut, field)
@@ -168,66 +171,3 @@ class ZoneAverage:
             return f"average over {words}" if words else ""
         parts = self.parts(field).items()
         return "; ".join(f"{name}: average over {describe_zone(z, field)}" for name, z in parts)
-
-
-@dataclass(frozen=True)
-class GridPoint:
-    """Settings of `point_samples` without the field, for use in a config; it has no products."""
-
-    states: Sequence[str]
-    z: float | None = None
-    r: float | None = None
-    products: ClassVar[tuple[str, ...]] = ()
-
-    def columns(self, names: Sequence[str]) -> list[str]:
-        """What the variables are called in the trajectory: as they are."""
-        return list(names)
-
-    def trajectory(self, field: xr.Dataset, *, inputs: Sequence[str], label: str) -> Trajectory:
-        return point_samples(
-            field, z=self.z, r=self.r, states=self.states, inputs=inputs, label=label
-        )
-
-    def place(self, field: xr.Dataset) -> str:
-        """Description of the grid point that is used."""
-        places = _nearest(field, z=self.z, r=self.r)
-        texts = [f"{a} = {1e3 * grid_points(field, a)[k]:.4g} mm" for a, (k,) in places.items()]
-        return f"the grid point at {', '.join(texts)}" if texts else ""
-
-
-def point_samples(
-    field: xr.Dataset,
-    *,
-    z: float | None = None,
-    r: float | None = None,
-    states: Sequence[str],
-    inputs: Sequence[str] = (),
-    label: str = "",
-) -> Trajectory:
-    """Samples at the grid point nearest to (z, r).
-
-    z, r: place in m; one is needed for each axis that the field has.
-
-    Raises ValueError for a place outside the grid's cells or without plasma.
-    """
-    nearest = _nearest(field, z=z, r=r)
-    return zone_average(field.isel(nearest), None, states=states, inputs=inputs, label=label)
-
-
-def _nearest(field: xr.Dataset, *, z: float | None, r: float | None) -> dict[str, list[int]]:
-    """Index of the grid point nearest to a place, for each axis."""
-    places = {axis: value for axis, value in (("z", z), ("r", r)) if value is not None}
-    axes = [axis for axis in SPACE if axis in field.dims]
-    if sorted(places) != sorted(axes):
-        raise ValueError(f"a point needs one place per axis {axes} of its field, got {places}")
-    nearest = {}
-    for axis, place in places.items():
-        points = grid_points(field, axis)
-        ends = cell_edges(points)[[0, -1]] if len(points) > 1 else points[[0, 0]]
-        if not ends[0] <= place <= ends[1]:
-            raise ValueError(
-                f"a point must lie on the grid, got {axis} = {place:g} m, the grid's cells reach "
-                f"from {ends[0]:g} to {ends[1]:g} m"
-            )
-        nearest[axis] = [int(np.argmin(np.abs(points - place)))]
-    return nearest

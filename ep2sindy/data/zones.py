@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float
 from ep2sindy.data.blocks import blocks_of
 from ep2sindy.data.fields import (
     SPACE,
+    cell_edges,
     cell_sizes,
     channel_length_m,
     check_field,
@@ -185,22 +186,27 @@ PARTS = {"channel": 1.0, "downstream": 0.4}
 class Zone:
     """Part of the grid: (from, to) in z and r, in m, ends included; None is the whole axis.
 
-    z: "channel" is the thruster's channel from the anode to the exit, "downstream" its last 40 %.
-    The channel's length comes from the field's attributes; a field without z needs none.
+    A number is a place: the grid point nearest to it. z: "channel" is the thruster's channel from
+    the anode to the exit, "downstream" its last 40 %. The channel's length comes from the field's
+    attributes; a field without z needs none.
     """
 
-    z: Sequence[float] | str | None = None
-    r: Sequence[float] | None = None
+    z: Sequence[float] | float | str | None = None
+    r: Sequence[float] | float | None = None
 
     def __post_init__(self) -> None:
         for axis in SPACE:
             bounds = getattr(self, axis)
             if bounds is None or (axis == "z" and isinstance(bounds, str) and bounds in PARTS):
                 continue
+            if isinstance(bounds, int | float):
+                object.__setattr__(self, axis, float(bounds))
+                continue
             if isinstance(bounds, str) or len(bounds) != 2 or not bounds[0] < bounds[1]:
                 names = f" or one of {', '.join(PARTS)}" if axis == "z" else ""
                 raise ValueError(
-                    f"a zone's {axis} must be two increasing numbers in m{names}, got {bounds!r}"
+                    f"a zone's {axis} must be a number or two increasing ones in m{names}, got "
+                    f"{bounds!r}"
                 )
             object.__setattr__(self, axis, (float(bounds[0]), float(bounds[1])))
 
@@ -239,7 +245,22 @@ def _at_peak(field: xr.Dataset) -> str:
 
 
 def _part_text(name: str) -> str:
-    return "the channel" if PARTS[name] == 1.0 else f"the last {PARTS[name]:.0%} of the channel"
+    return (
+        "the channel"
+        if PARTS[name] == 1.0
+        else f"the last {100.0 * PARTS[name]:.0f} % of the channel"
+    )
+
+
+def _nearest(points: Float[np.ndarray, " points"], place: float, axis: str) -> int:
+    """Index of the grid point nearest to a place within the grid's cells."""
+    ends = cell_edges(points)[[0, -1]] if len(points) > 1 else points[[0, 0]]
+    if not ends[0] <= place <= ends[1]:
+        raise ValueError(
+            f"a point must lie on the grid, got {axis} = {place:g} m, the grid's cells reach "
+            f"from {ends[0]:g} to {ends[1]:g} m"
+        )
+    return int(np.argmin(np.abs(points - place)))
 
 
 def describe_zone(zone: Zone | None, field: xr.Dataset) -> str:
@@ -250,12 +271,15 @@ def describe_zone(zone: Zone | None, field: xr.Dataset) -> str:
     for axis in SPACE:
         if axis in field.dims:
             points = grid_points(field, axis)
-            bounds = getattr(ends, axis) or points[[0, -1]]
-            n_points = len(points[slices.get(axis, slice(None))])
-            of_all = "all" if n_points == len(points) else f"{n_points} of"
+            bounds = getattr(ends, axis)
+            inside = points[slices.get(axis, slice(None))]
+            if isinstance(bounds, float):
+                texts.append(f"{axis} = {1e3 * inside[0]:.4g} mm (one grid point)")
+                continue
+            first, last = points[[0, -1]] if bounds is None else bounds
+            of_all = "all" if len(inside) == len(points) else f"{len(inside)} of"
             texts.append(
-                f"{axis} {1e3 * bounds[0]:.4g} to {1e3 * bounds[1]:.4g} mm "
-                f"({of_all} {len(points)} points)"
+                f"{axis} {1e3 * first:.4g} to {1e3 * last:.4g} mm ({of_all} {len(points)} points)"
             )
     if texts and zone is not None and isinstance(zone.z, str) and "z" in field.dims:
         length_mm = 1e3 * float(channel_length_m(field.attrs) or np.nan)
@@ -280,6 +304,10 @@ def zone_slices(field: xr.Dataset, zone: Zone) -> dict[str, slice]:
                 f"{list(field.dims)}; leave {axis} out of the zone"
             )
         points = grid_points(field, axis)
+        if isinstance(bounds, float):
+            nearest = _nearest(points, bounds, axis)
+            slices[axis] = slice(nearest, nearest + 1)
+            continue
         rounding = 1e-6 * np.ptp(points)  # a grid stored as float32 must not lose its end points
         start = int(np.searchsorted(points, bounds[0] - rounding, side="left"))
         stop = int(np.searchsorted(points, bounds[1] + rounding, side="right"))

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.linalg import block_diag
 
-from ep2sindy.data.coerce import Task
+from ep2sindy.data.coerce import DiscoveryProblem
 from ep2sindy.data.gaps import mean_step
 from ep2sindy.data.trajectory import Trajectory, spread_blocks
 from ep2sindy.discovery.result import Discovery, DiscoveryMethod, NoiseTest
@@ -26,7 +26,7 @@ from ep2sindy.library.relations import Constraint, Relation, binding, constraint
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.regression.constrained import constrained_fit
 from ep2sindy.regression.formulations import RandomSplit, Weak
-from ep2sindy.regression.front import Candidate, LeftOver, ParetoFront, fit_support
+from ep2sindy.regression.front import Candidate, ParetoFront, Residual, fit_support
 from ep2sindy.regression.least_squares import LeastSquares
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.whitening import NEGLIGIBLE, whiten_rows
@@ -58,7 +58,7 @@ SMALLEST = np.finfo(np.float64).tiny  # for exact fits, without residuals
 def choose(
     fronts: Sequence[ParetoFront],
     method: DiscoveryMethod,
-    task: Task,
+    task: DiscoveryProblem,
     *,
     provenance: Mapping[str, str],
     progress: Progress = SILENT,
@@ -193,9 +193,9 @@ def _assess_rest(model: SparseModel, runs: Sequence[Trajectory]) -> tuple[str, s
 
 def _test_on_weak_rows(
     choice: Discovery, runs: Sequence[Trajectory], states: Sequence[str]
-) -> dict[str, LeftOver]:
+) -> dict[str, Residual]:
     """Residuals of some equations on weak rows, as far as their rows can be made and whitened."""
-    model, n_free, left = choice.model, choice.noise_test.n_free, dict[str, LeftOver]()
+    model, n_free, left = choice.model, choice.noise_test.n_free, dict[str, Residual]()
     try:
         # Same result as with the whole library, at a fraction of the cost.
         used = np.isin(model.library.names, [name for s in states for name in model.terms(s)])
@@ -226,7 +226,7 @@ def _count_free(held: Constraint, relations: Sequence[Relation]) -> dict[str, in
     }
 
 
-def _describe_lack_of_fit(left: Mapping[str, LeftOver], related: Collection[str]) -> str:
+def _describe_lack_of_fit(left: Mapping[str, Residual], related: Collection[str]) -> str:
     """Sentence on the equations whose residuals exceed the noise; empty if there are none.
 
     related: states whose coefficients obey relations.
@@ -317,7 +317,7 @@ def whiten_terms(
     return rows.theta[:, order], rows.target, scale[order]
 
 
-def _test_fit(problem: RegressionRows, fit: Candidate, *, n_free: int) -> LeftOver:
+def _test_fit(problem: RegressionRows, fit: Candidate, *, n_free: int) -> Residual:
     """Residuals of a fit with its own coefficients, whitened about a free fit of its terms.
 
     The free fit is as close to the data as these terms allow, so the samples are corrected by it,
@@ -328,13 +328,13 @@ def _test_fit(problem: RegressionRows, fit: Candidate, *, n_free: int) -> LeftOv
     return _compare_with_noise(target - theta @ (fit.coef / scale), n_free=n_free)
 
 
-def _compare_with_noise(left: Float[np.ndarray, " rows"], *, n_free: int) -> LeftOver:
+def _compare_with_noise(left: Float[np.ndarray, " rows"], *, n_free: int) -> Residual:
     """Compare whitened residuals with white noise of variance 1; n_free: fitted coefficients."""
     freedom = max(len(left) - n_free, 1)
     chi_squared = float(left @ left) / freedom
     leaves_noise = chi_squared <= MAX_CHI_SQUARED + STANDARD_ERRORS * np.sqrt(2.0 / freedom)
     autocorrelation = float(left[1:] @ left[:-1]) / max(float(left @ left), SMALLEST)
-    return LeftOver(chi_squared, autocorrelation, bool(leaves_noise))
+    return Residual(chi_squared, autocorrelation, bool(leaves_noise))
 
 
 def _least_sum(

@@ -9,7 +9,7 @@ from itertools import chain, count, islice
 
 import numpy as np
 
-from ep2sindy.data.coerce import Task
+from ep2sindy.data.coerce import DiscoveryProblem
 from ep2sindy.data.runs import Runs, trajectories_of
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.choice import assess_noise
@@ -86,7 +86,7 @@ def discover(
     hidden = _hidden_names(hidden, names)
     library = polynomial(list(dict.fromkeys([*names, *hidden]))) if library is None else library
     check_kind("method", method, DiscoveryMethod, "ep.Regression(selection=ep.EBIC())")
-    task = Task(trajectories, library, hidden)
+    task = DiscoveryProblem(trajectories, library, hidden)
     rng, watch = np.random.default_rng(seed), as_progress(progress)
     together = shared or law is not None
     if together:
@@ -107,13 +107,13 @@ def _hidden_names(hidden: Sequence[str] | int, taken: Sequence[str]) -> Sequence
     return list(islice((name for name in names if name not in taken), n))
 
 
-def _points_of(task: Task) -> Mapping[str, Sequence[Trajectory]]:
+def _points_of(task: DiscoveryProblem) -> Mapping[str, Sequence[Trajectory]]:
     """The runs of every operating point, by its label."""
     return group_by_point(task.runs, [v for v in task.library.variables if v not in task.hidden])
 
 
 def _discover_apart(
-    task: Task,
+    task: DiscoveryProblem,
     method: DiscoveryMethod,
     workers: Workers,
     rng: np.random.Generator,
@@ -129,7 +129,7 @@ def _discover_apart(
 
 
 def _discover_together(
-    task: Task,
+    task: DiscoveryProblem,
     method: DiscoveryMethod,
     law: LawFunctions | Sequence[LawFunctions] | None,
     rng: np.random.Generator,
@@ -137,7 +137,7 @@ def _discover_together(
 ) -> Discovery:
     """One support for all points, and the law of its coefficients if one is asked for."""
     # This loads torch, only for a law or a support of several operating points.
-    from ep2sindy.discovery.several_points import PointsTask
+    from ep2sindy.discovery.several_points import PointsProblem
 
     points, structure = _points_of(task), None
     if task.facts.roles is not None:
@@ -147,12 +147,12 @@ def _discover_together(
         assert structure is not None
         terms = {s: [t for state, t in structure.coefficients if state == s] for s in task.states}
         task = replace(task, library=task.library.plain.only(terms))
-    several = PointsTask(task, points, method, structure)
+    several = PointsProblem(task, points, method, structure)
     return several.discover(law, rng=rng, progress=progress)
 
 
 def _discover_point(
-    piece: tuple[Task, np.random.Generator],
+    piece: tuple[DiscoveryProblem, np.random.Generator],
     *,
     method: DiscoveryMethod,
     progress: Progress = SILENT,

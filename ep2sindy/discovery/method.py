@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool
 
-from ep2sindy.data.coerce import Task, noise_inside
+from ep2sindy.data.coerce import DiscoveryProblem, noise_inside
 from ep2sindy.data.numbers import column_norms
 from ep2sindy.data.sensor import bounds_of
 from ep2sindy.data.trajectory import Trajectory
@@ -90,7 +90,7 @@ class TrajectorySearch:
         return {"search": repr(self), "selection": repr(self.selection)}
 
     def identify(
-        self, task: Task, *, rng: np.random.Generator, progress: Progress = SILENT
+        self, task: DiscoveryProblem, *, rng: np.random.Generator, progress: Progress = SILENT
     ) -> Discovery:
         """Estimate states and coefficients, and choose; the search is deterministic.
 
@@ -105,7 +105,7 @@ class TrajectorySearch:
             )
         found = self._estimate(task, progress)
         library = task.library.with_known_terms(task.states)
-        task = Task(found.runs, library)
+        task = DiscoveryProblem(found.runs, library)
         return replace(
             self._choose(found, task, progress),
             ambiguities=_ambiguities_of_samples(task),
@@ -113,7 +113,7 @@ class TrajectorySearch:
             estimate=found,
         )
 
-    def _estimate(self, task: Task, progress: Progress) -> Estimate:
+    def _estimate(self, task: DiscoveryProblem, progress: Progress) -> Estimate:
         provenance = self.provenance | _labels(task)
         return estimate(
             task.runs,
@@ -127,7 +127,7 @@ class TrajectorySearch:
             progress=progress,
         )
 
-    def _choose(self, found: Estimate, task: Task, progress: Progress) -> Discovery:
+    def _choose(self, found: Estimate, task: DiscoveryProblem, progress: Progress) -> Discovery:
         """Candidates of every equation with their scores, and the model by the selection rule."""
         fronts = [_front(s, found.supports[s], task.library, self.depth) for s in task.states]
         decision = self.selection.decide(fronts, task, progress=progress)
@@ -144,7 +144,7 @@ class TrajectorySearch:
         self, runs: Sequence[Trajectory], library: Library, *, rng: np.random.Generator | int
     ) -> Finding:
         """Supports alone, as a benchmark counts them."""
-        task = Task(runs, library)
+        task = DiscoveryProblem(runs, library)
         found = self._estimate(task, SILENT)
         model = self._choose(found, task, SILENT).model
         return Finding(
@@ -167,7 +167,7 @@ def _front(
     return ParetoFront(state, [Candidate.of(state, coef, s.deviance) for coef, s in pairs])
 
 
-def _ambiguities_of_samples(task: Task) -> tuple[Ambiguity, ...]:
+def _ambiguities_of_samples(task: DiscoveryProblem) -> tuple[Ambiguity, ...]:
     """Terms whose values at the samples cannot be distinguished."""
     library = task.library
     values = [noise_inside(library, run.columns(library.variables)) for run in task.runs]
@@ -239,7 +239,7 @@ class Regression:
         }
 
     def identify(
-        self, task: Task, *, rng: np.random.Generator, progress: Progress = SILENT
+        self, task: DiscoveryProblem, *, rng: np.random.Generator, progress: Progress = SILENT
     ) -> Discovery:
         """Assemble rows, search them, and choose. Raises ValueError for hidden states."""
         if task.hidden:
@@ -265,7 +265,7 @@ class Regression:
         return replace(choice, ambiguities=tuple(dict.fromkeys(found)), data_warnings=data_warnings)
 
     def _choose_under(
-        self, roles: Roles, task: Task, *, rng: np.random.Generator, progress: Progress
+        self, roles: Roles, task: DiscoveryProblem, *, rng: np.random.Generator, progress: Progress
     ) -> Discovery:
         """Search all equations at once for systems that keep the roles, and let the rule decide.
 
@@ -289,7 +289,7 @@ class Regression:
         return choose_system(systems.fronts, decision, self, task.runs, provenance=provenance)
 
     def search_equations(
-        self, task: Task, *, rng: np.random.Generator | int, progress: Progress = SILENT
+        self, task: DiscoveryProblem, *, rng: np.random.Generator | int, progress: Progress = SILENT
     ) -> list[SearchedEquation]:
         """Assemble the rows, search every bootstrap of them, and fit the supports found."""
         rng, equations = np.random.default_rng(rng), []
@@ -309,7 +309,7 @@ class Regression:
         return equations
 
     def choose(
-        self, fronts: Sequence[ParetoFront], task: Task, *, progress: Progress = SILENT
+        self, fronts: Sequence[ParetoFront], task: DiscoveryProblem, *, progress: Progress = SILENT
     ) -> Discovery:
         """Select a candidate from every front, and fit it."""
         provenance = self.provenance | _labels(task)
@@ -319,7 +319,7 @@ class Regression:
         self, runs: Sequence[Trajectory], library: Library, *, rng: np.random.Generator | int
     ) -> Finding:
         """Supports alone, as a benchmark counts them."""
-        task = Task(runs, library)
+        task = DiscoveryProblem(runs, library)
         fronts = [e.front for e in self.search_equations(task, rng=rng)]
         scores = self.selection.decide(fronts, task).scores
         chosen = [f.with_scores(s).best for f, s in zip(fronts, scores, strict=True)]
@@ -332,7 +332,7 @@ class Regression:
 AnyMethod = TrajectorySearch | Regression
 
 
-def _labels(task: Task) -> dict[str, str]:
+def _labels(task: DiscoveryProblem) -> dict[str, str]:
     return {"trajectories": ", ".join(run.label for run in task.runs)}
 
 

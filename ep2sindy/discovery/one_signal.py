@@ -15,7 +15,7 @@ from functools import partial
 
 import numpy as np
 
-from ep2sindy.data.coerce import Task
+from ep2sindy.data.coerce import DiscoveryProblem
 from ep2sindy.data.numbers import least_beside_grid
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import discover
@@ -174,7 +174,7 @@ class Preparation:
             method = Regression(search=BestSubset(max_terms=method.max_terms or FIRST_MAX_TERMS))
         try:
             library = self._library(states, functions, stated)
-            equations = method.search_equations(Task([states.run], library), rng=0)
+            equations = method.search_equations(DiscoveryProblem([states.run], library), rng=0)
         except ValueError:
             return float("inf")
         fronts = [each.front for each in equations if each.front.equation not in states.known]

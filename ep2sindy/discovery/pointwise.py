@@ -15,7 +15,7 @@ import numpy as np
 import xarray as xr
 from jaxtyping import Bool, Float
 
-from ep2sindy.data.coerce import Task
+from ep2sindy.data.coerce import DiscoveryProblem
 from ep2sindy.data.fields import SPACE, check_field, grid_points, grid_values
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import Trajectory
@@ -265,7 +265,7 @@ def blocks_of(field: xr.Dataset, n_points: int) -> list[dict[str, slice]]:
 
 def search_point(run: Trajectory, search: PointSearch) -> dict[str, np.ndarray]:
     """Search, select and fit at one point, and the spread over the bootstraps."""
-    task = Task([run], search.library)
+    task = DiscoveryProblem([run], search.library)
     equations = search.method.search_equations(task, rng=np.random.default_rng(search.seed))
     choice = search.method.choose([equation.front for equation in equations], task)
     parts = zip(equations, choice.chosen.values(), choice.model.coef.T, strict=True)

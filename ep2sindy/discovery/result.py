@@ -14,7 +14,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from ep2sindy._stubs import dotted_names, place_of
-from ep2sindy.data.coerce import Task
+from ep2sindy.data.coerce import DiscoveryProblem
 from ep2sindy.data.runs import Run
 from ep2sindy.estimation.estimate import Estimate
 from ep2sindy.forecasting.forecast import Forecast, forecast
@@ -26,7 +26,7 @@ from ep2sindy.model.storage import read_as, read_stored
 from ep2sindy.operating.law import OperatingLaw
 from ep2sindy.operating.records import most_central
 from ep2sindy.regression.ambiguity import Ambiguity
-from ep2sindy.regression.front import Candidate, Ensemble, LeftOver, ParetoFront
+from ep2sindy.regression.front import Candidate, Ensemble, ParetoFront, Residual
 from ep2sindy.runtime.files import write_text
 from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.runtime.screen import N_LINES, one_screen, sentences
@@ -49,7 +49,7 @@ class NoiseTest:
     law, which rest or drift; empty if there are none.
     """
 
-    left: Mapping[str, LeftOver] = field(default_factory=dict)
+    left: Mapping[str, Residual] = field(default_factory=dict)
     lack_of_fit: str = ""
     tested: bool = False
     n_free: Mapping[str, int] = field(default_factory=dict)
@@ -61,7 +61,7 @@ class DiscoveryMethod(Protocol):
     """Protocol of a method that finds equations from runs: `TrajectorySearch`, or `Regression`.
 
     selection: the rule that chooses among candidates; it is named in the headline of the result.
-    identify: answers a `Task`. A method of one's own may ask another one:
+    identify: answers a `DiscoveryProblem`. A method of one's own may ask another one:
 
     >>> class Smallest:
     ...     selection = ep.discovery.Evidence()
@@ -78,7 +78,7 @@ class DiscoveryMethod(Protocol):
     def selection(self) -> Selection: ...
 
     def identify(
-        self, task: Task, *, rng: np.random.Generator, progress: Progress = SILENT
+        self, task: DiscoveryProblem, *, rng: np.random.Generator, progress: Progress = SILENT
     ) -> Discovery: ...
 
 
@@ -90,7 +90,7 @@ STORED = {
         Candidate,
         Ensemble,
         Constraint,
-        LeftOver,
+        Residual,
         NoiseTest,
         OtherSystem,
         ParetoFront,

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.data.coerce import Task
+from ep2sindy.data.coerce import DiscoveryProblem
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.choice import join_choice
 from ep2sindy.discovery.method import Regression, TrajectorySearch
@@ -38,7 +38,7 @@ WINDOWS = RefinementSettings(n_windows=20, periods=2.0, n_reweights=0)
 
 
 @dataclass(frozen=True, eq=False)
-class PointsTask:
+class PointsProblem:
     """What is asked of several operating points together, and the method that answers it.
 
     points: the runs of each point, by its label. structure: the constraint of terms that a search
@@ -46,7 +46,7 @@ class PointsTask:
     Raises ValueError for hidden states, or a method that cannot weigh all points at once.
     """
 
-    asked: Task
+    asked: DiscoveryProblem
     points: Mapping[str, Sequence[Trajectory]]
     method: DiscoveryMethod
     structure: Constraint | None = None

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ep2sindy.data.coerce import Task
+from ep2sindy.data.coerce import DiscoveryProblem
 from ep2sindy.discovery.method import Regression
 from ep2sindy.regression.ambiguity import usable_terms
 from ep2sindy.regression.front import ParetoFront, errors_of, fit_supports, order_front
@@ -58,7 +58,7 @@ def check_shared(method: Regression) -> BestSubset:
 
 
 def search_shared(
-    problems: Problems, task: Task, method: Regression, *, progress: Progress
+    problems: Problems, task: DiscoveryProblem, method: Regression, *, progress: Progress
 ) -> list[SharedFront]:
     """Find the supports whose terms are the same at every operating point, for every equation.
 
@@ -92,7 +92,7 @@ def _shared_front(
     equation: str,
     search: BestSubset,
     method: Regression,
-    task: Task,
+    task: DiscoveryProblem,
 ) -> SharedFront:
     """Search the Gram matrices of all points at once, and fit the supports at each point."""
     any_problem = next(iter(problems.values()))
@@ -140,7 +140,10 @@ def _keep_determined(
 
 
 def _summed_scores(
-    fronts: Sequence[SharedFront], selection: Selection, points: Sequence[str], task: Task
+    fronts: Sequence[SharedFront],
+    selection: Selection,
+    points: Sequence[str],
+    task: DiscoveryProblem,
 ) -> list[Float[np.ndarray, " supports"]]:
     rule = selection.shared_by(len(points)) if isinstance(selection, EBIC) else selection
     by_point = [rule.decide([front.points[p] for front in fronts], task).scores for p in points]

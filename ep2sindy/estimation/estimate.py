@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ep2sindy.data.coerce import Task, check_domain
+from ep2sindy.data.coerce import DiscoveryProblem, check_domain
 from ep2sindy.data.runs import Runs, trajectories_of
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.estimation.cost import SearchMonitor, check_limit_s, check_size, growing_parts
@@ -169,10 +169,10 @@ def estimate(
     ['x', 'x*y']
 
     Raises ValueError for fewer than one term, a limit that is not positive, a library that needs
-    more samples than there are or more memory, an unknown input or course, or whatever a `Task`
-    refuses.
+    more samples than there are or more memory, an unknown input or course, or whatever a
+    `DiscoveryProblem` refuses.
     """
-    task = Task(trajectories_of(runs, partial=True), library, hidden)
+    task = DiscoveryProblem(trajectories_of(runs, partial=True), library, hidden)
     if max_terms is not None:
         max_terms = check_count("max_terms", max_terms)
     check_limit_s(limit_s)
@@ -212,7 +212,9 @@ class _Settings(NamedTuple):
     monitor: SearchMonitor
 
 
-def _answer(task: Task, settings: _Settings) -> tuple[Explanation, Sequence[Trajectory]]:
+def _answer(
+    task: DiscoveryProblem, settings: _Settings
+) -> tuple[Explanation, Sequence[Trajectory]]:
     """Answer a task from all of its runs.
 
     The ways in which hidden states may enter are tried under process noise first. Those that
@@ -252,7 +254,12 @@ class _Way:
     words: tuple[str, ...]
 
     @staticmethod
-    def of(task: Task, known: Task, couplings: Sequence[Coupling], settings: _Settings) -> _Way:
+    def of(
+        task: DiscoveryProblem,
+        known: DiscoveryProblem,
+        couplings: Sequence[Coupling],
+        settings: _Settings,
+    ) -> _Way:
         """known: the task with guesses of hidden states, which are no states of it."""
         check_runs(known)
         measured = task.runs[0].state_names
@@ -330,7 +337,7 @@ def _report(
     )
 
 
-def check_runs(task: Task) -> None:
+def check_runs(task: DiscoveryProblem) -> None:
     """Raise ValueError for too few samples, or some outside the domain of a library's function."""
     n_samples = sum(run.n_samples for run in task.runs)
     if n_samples <= len(task.library):
@@ -432,6 +439,6 @@ def _open_choice(
         return ""
     return (
         f"{problem.n_samples} samples do not tell these equations from others: the chance that all "
-        f"terms are right is {fraction:.0%}; name the terms that you know (Library.only), take a "
-        "smaller library, or a longer record"
+        f"terms are right is {100.0 * fraction:.0f} %; name the terms that you know "
+        "(Library.only), take a smaller library, or a longer record"
     )

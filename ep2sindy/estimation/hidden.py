@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.interpolate import make_interp_spline
 
-from ep2sindy.data.coerce import Task
+from ep2sindy.data.coerce import DiscoveryProblem
 from ep2sindy.data.numbers import least_squares
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library
@@ -98,7 +98,9 @@ def couplings(
     return list(product(*choices))
 
 
-def with_guesses(task: Task) -> Iterator[list[tuple[Task, tuple[Coupling, ...]]]]:
+def with_guesses(
+    task: DiscoveryProblem,
+) -> Iterator[list[tuple[DiscoveryProblem, tuple[Coupling, ...]]]]:
     """Tasks without hidden states, one for every way in: guesses stand among the samples.
 
     They come in groups, the most natural first; the next group counts if no way of it fits. A
@@ -118,7 +120,7 @@ def with_guesses(task: Task) -> Iterator[list[tuple[Task, tuple[Coupling, ...]]]
         yield [(_insert_guesses(task, ways), ways) for ways in group]
 
 
-def _insert_guesses(task: Task, ways: Sequence[Coupling]) -> Task:
+def _insert_guesses(task: DiscoveryProblem, ways: Sequence[Coupling]) -> DiscoveryProblem:
     """The task with guesses of its hidden states, whose scales are fixed by relations.
 
     The equation of a single measured state has one term, unless others of it are known.
@@ -127,7 +129,7 @@ def _insert_guesses(task: Task, ways: Sequence[Coupling]) -> Task:
     library = task.library.relate(*(way.relation for way in ways if not way.given))
     if len(task.runs[0].state_names) == 1 and first.state not in task.facts.only:
         library = library.only({first.state: (first.term,)})
-    return Task([with_guess(run, library, ways) for run in task.runs], library)
+    return DiscoveryProblem([with_guess(run, library, ways) for run in task.runs], library)
 
 
 def with_guess(run: Trajectory, library: Library, ways: Sequence[Coupling]) -> Trajectory:

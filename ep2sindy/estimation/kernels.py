@@ -117,7 +117,7 @@ def marginalise(flow, defects, residuals, variance, process, free_start):
     n, d = residuals.shape
     state, cov = _at_start(d, flow.shape[2] - d, free_start)
     n_rows = max(FEWEST, PIECE // cov)
-    whitened, room = np.empty((min(n, max(1, n_rows // d)), d, cov)), _subpackage_of(state)
+    whitened, room = np.empty((min(n, max(1, n_rows // d)), d, cov)), _workspace_of(state)
     gram, log_spread, case = np.zeros((cov, cov)), 0.0, (defects, residuals, variance, process)
     # Each whitened row is (-e, -de/dc) / sqrt(s) of one sample, so that the sum of their squares, a
     # quadratic function of c, is the sum over samples of e^2 / s.
@@ -137,7 +137,7 @@ def filter_states(flow, defects, residuals, variance, process, free_start):
     n, d = residuals.shape
     state, cov = _at_start(d, 0, free_start)
     whitened, case = np.empty((n, d, cov)), (defects, residuals, variance, process)
-    _filter(0, flow, *case, state, cov, *_subpackage_of(state), whitened, *_no_history(d))
+    _filter(0, flow, *case, state, cov, *_workspace_of(state), whitened, *_no_history(d))
     found = np.where(np.isfinite(residuals), -whitened[:, :, 0], np.nan)
     return found, state[:, 0], state[:, cov : cov + d]
 
@@ -153,13 +153,13 @@ def smooth_corrections(flow, defects, residuals, variance, process, free_start):
     state, cov = _at_start(d, 0, free_start)
     whitened, case = np.empty((n, d, cov + d)), (defects, residuals, variance, process)
     history = np.empty((n, d)), np.empty((n, *state.shape))
-    _filter(0, flow, *case, state, cov, *_subpackage_of(state), whitened, *history)
+    _filter(0, flow, *case, state, cov, *_workspace_of(state), whitened, *history)
     found = np.empty((n, d))
     _look_back(flow, whitened, *history, cov, np.zeros((2, d)), found)
     return found
 
 
-def _subpackage_of(state):
+def _workspace_of(state):
     """Scratch of `_filter`: the rows ahead, one row, and the gains."""
     return np.empty_like(state), np.empty(state.shape[1]), np.empty(len(state))
 

@@ -205,7 +205,7 @@ def suspect_delays(
 
 
 def delay_penalty(problem: EstimationProblem) -> float:
-    """Price of a delay: that of a coefficient, chosen among as many as there are channels."""
+    """Penalty of a delay: that of a coefficient, chosen among as many as there are channels."""
     return log(problem.n_samples) + 2.0 * log(problem.measured.sum())
 
 

@@ -37,7 +37,7 @@ class PenalisedFit:
 
 
 def term_penalties(problem: EstimationProblem, n_samples: float) -> ByCoefficient:
-    """Price of each coefficient: the fall of the squares that justifies it.
+    """Penalty of each coefficient: the fall of the squares that justifies it.
 
     The penalty is log n plus a cost of choosing among terms. A term of degree q is one of d C(d +
     q, q), and every degree above the first is half as likely a priori as the one below; a constant
@@ -131,7 +131,7 @@ def penalise(gram: Gram, support: Support, penalties: ByCoefficient) -> Penalise
     return PenalisedFit(support, free, float(rest + penalties[support].sum()))
 
 
-class Offered(NamedTuple):
+class Proposals(NamedTuple):
     """A support, and the squares that it leaves plus the penalties of its terms."""
 
     support: Support
@@ -140,7 +140,7 @@ class Offered(NamedTuple):
 
 def offer_supports(
     problem: EstimationProblem, gram: Gram, penalties: ByCoefficient, chosen: Support, own: Support
-) -> list[Offered]:
+) -> list[Proposals]:
     """The best few supports of every size of one equation, the other equations as chosen.
 
     Their coefficients and required ones stay free. own: mask of the equation's coefficients.
@@ -151,7 +151,7 @@ def offer_supports(
     rest = gram.select(either).minimise(kept[either])
     xx, xy, yy = rest.quadratic, rest.linear, max(rest.offset, 1.0)
     if not own.any():
-        return [Offered(kept, yy + penalties[kept].sum())]
+        return [Proposals(kept, yy + penalties[kept].sum())]
     # A column that the kept ones span leaves only rounding: it is not available.
     square = np.diag(xx).copy()
     square[~(square > DEPENDENT * np.abs(np.diag(gram.quadratic)[own]))] = 0.0
@@ -173,13 +173,13 @@ def offer_supports(
     for mask, gain in zip(masks, _gains(unit, target, masks), strict=True):
         support = kept.copy()
         support[own] = mask
-        found.append(Offered(support, yy - gain + penalties[support].sum()))
+        found.append(Proposals(support, yy - gain + penalties[support].sum()))
     return _admit(problem, gram, penalties, found) if problem.positive.any() else found
 
 
 def _admit(
-    problem: EstimationProblem, gram: Gram, penalties: ByCoefficient, offered: Sequence[Offered]
-) -> list[Offered]:
+    problem: EstimationProblem, gram: Gram, penalties: ByCoefficient, offered: Sequence[Proposals]
+) -> list[Proposals]:
     """The supports on which coefficients that must be positive are.
 
     One that has negative ones is replaced by what least squares with bounds leaves of it.
@@ -191,7 +191,7 @@ def _admit(
             own, quadratic = np.flatnonzero(support), gram.quadratic[np.ix_(support, support)]
             kept = within_bounds(quadratic, gram.linear[support], problem.positive[support])
             support = np.isin(np.arange(len(support)), own[kept])
-            each = Offered(support, penalise(gram, support, penalties).score)
+            each = Proposals(support, penalise(gram, support, penalties).score)
         found[support.tobytes()] = each
     return list(found.values())
 

@@ -59,13 +59,16 @@ def cycle_figure(run: Trajectory | None, cycle: LimitCycle) -> Figure:
     """A model's limit cycle over data in the plane of its first two states, and other runs.
 
     run: the data; None leaves them out. Other runs start off the cycle, at the dots. A run that
-    leaves the panel is not drawn again.
+    leaves the panel is not drawn again. A neutral cycle is one of a family, and is called so.
     """
+    own, others = "the model's cycle", "from other starts"
+    if cycle.stability == "neutral":
+        own, others = "the cycle from the record's start", "others of the family"
     plane, paths = cycle.model.states[:2], paths_off(cycle)
     figure, (ax,) = style.make_grid(1, width=4.4, height=3.8, extra=0.5)
     handles = [
-        Line2D([], [], color=COLOURS[1], lw=2.0, label="the model's cycle"),
-        Line2D([], [], color=COLOURS[5], marker="o", ms=4, lw=0.8, label="from other starts"),
+        Line2D([], [], color=COLOURS[1], lw=2.0, label=own),
+        Line2D([], [], color=COLOURS[5], marker="o", ms=4, lw=0.8, label=others),
     ]
     closed = np.concatenate([cycle.states, cycle.states[:1]])[:, :2]
     data = closed

@@ -172,9 +172,12 @@ def _draw_shapes(ax: Axes, rows: pd.DataFrame) -> None:
     """Draw waveform errors against amplitude errors."""
     names = [str(name) for name in rows]
     of = "amplitude_ratio_"
+    far_percent, far_waveform = 12.0, 0.24  # a little beyond the bounds, and up to the farthest
     states = [name.removeprefix(of) for name in names if name.startswith(of)]
     for state, marker, colour in zip(states, cycle(MARKERS), cycle(MORE_COLOURS), strict=False):
         off, error = 100.0 * (rows[f"{of}{state}"] - 1.0), rows[f"waveform_error_{state}"]
+        far_percent = max(far_percent, min(1.2 * off.abs().max(), FAR_PERCENT))
+        far_waveform = max(far_waveform, min(1.2 * error.max(), FAR_WAVEFORM))
         near = (off.abs() <= FAR_PERCENT) & (error <= FAR_WAVEFORM)
         mark: dict[str, Any] = {"ls": "none", "marker": marker, "color": colour, "ms": 6}
         ax.plot(off[near], error[near], mfc="none", label=f"${latex_name(state)}$", **mark)
@@ -185,7 +188,7 @@ def _draw_shapes(ax: Axes, rows: pd.DataFrame) -> None:
     ax.axvspan(-10, 10, color=GREY, alpha=0.3, lw=0, label="10 % of amplitude")
     ax.axhline(0.2, color=GREY, lw=1.0, label="0.2 of waveform")
     ax.set(xlabel="error of the amplitude (%)", ylabel="error of the waveform (std)")
-    ax.set(xlim=(-FAR_PERCENT, FAR_PERCENT), ylim=(0.0, FAR_WAVEFORM))
+    ax.set(xlim=(-far_percent, far_percent), ylim=(0.0, far_waveform))
 
 
 def frequency_scale(f_kHz: pd.Series) -> tuple[float, str]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import cycle
+from textwrap import wrap
 from types import MappingProxyType
 from typing import Any
 
@@ -30,6 +31,7 @@ from ep2sindy.signals.spectrum import dominant_frequency, power_spectrum
 
 SINCE_START = "time since start of integration"
 
+LABEL = 18  # letters in a line of a model's label next to or above its panel
 RARE = 0.01  # fraction of derivative samples, low or high, kept out of the scale as edge spikes
 
 
@@ -90,7 +92,7 @@ def derivative_figure(
         slopes = model.derivative(run.columns(model.states), run.columns(model.inputs))
         slopes = slopes[:, [model.states.index(state) for state in run.state_names]]
         curves = first_part(run.t, clock.seconds * slopes, duration_s, clock)
-        sides.append(replace(curves, label=name))
+        sides.append(replace(curves, label=_label(name)))
     titles = [style.slope_label(name, clock.rate_unit(run.units[name])) for name in run.state_names]
     x_label, limits = _time_label(clock, duration_s), limits_of(data, sides, RARE)
     return _draw_rows(data, sides, titles, x_label, limits=limits)[0]
@@ -159,7 +161,7 @@ def _draw_rows(
         ax.yaxis.get_offset_text().set_visible(False)
     for column, title in zip(axes.T, titles, strict=True):
         column[0].set_title(title, fontsize=TITLE)
-        column[-1].set_xlabel(x_label)
+    figure.supxlabel(x_label, fontsize=SMALL)  # once: three columns have no width for it
     style.legend_curves(figure, list(axes.flat))
     return figure, axes
 
@@ -248,7 +250,12 @@ def limits_of(data: Curves, models: Sequence[Curves], rare: float = 0.0) -> list
 def _run_label(name: str, run: Rollout, statuses: Mapping[str, str]) -> str:
     """The name, and below it the status if it is known; for a diverged run the time it lasted."""
     status = when_it_diverges(run) if run.diverged else statuses.get(name)
-    return f"{name}\n({status})" if status else name
+    return f"{_label(name)}\n({status})" if status else _label(name)
+
+
+def _label(name: str) -> str:
+    """A model's name in words, in lines that leave room for its panel."""
+    return "\n".join(wrap(name.replace("_", " "), LABEL))
 
 
 def when_it_diverges(rollout: Rollout) -> str:
@@ -340,4 +347,5 @@ def _draw_errors(ax: Axes, skill: ForecastSkill) -> None:
         ax.plot(horizons, np.maximum(values, FLOOR), label=name, **look)
     ax.axhline(1.0, color=GREY, lw=0.8, ls="--")
     ax.set(yscale="log", ylabel="error (standard deviations)")
+    style.label_decades(ax)
     ax.set_xlabel(f"horizon ({skill.unit})")

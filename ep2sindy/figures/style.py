@@ -19,7 +19,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.text import Text
-from matplotlib.ticker import ScalarFormatter
+from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter, ScalarFormatter
 
 from ep2sindy.library.equations import latex_derivative, latex_name
 
@@ -53,6 +53,8 @@ OFF_SCALE, STOPS = "off scale", "diverged"
 SIGN = "#555555"  # colour of legend marks, which stand for marks of any colour
 
 HOVER = "hover: "  # prefix of the id of an artist with a hover text, which pages look for
+
+FEW_DECADES = 100.0  # ratio of the ends of a logarithmic axis with ticks inside its decades
 
 N_LINE = 60  # points on the line of a law
 
@@ -92,6 +94,15 @@ def make_row(n: int, *, width: float, height: float) -> tuple[Figure, Sequence[A
     size = (min(WIDTH, width * n + 0.4), height)
     figure, (axes,) = make_panels(1, n, size, sharex=True, sharey=True)
     return figure, [*axes]
+
+
+def label_decades(ax: Axes) -> None:
+    """Ticks of a logarithmic ordinate at 1, 2 and 5 of decades, or at decades if there are many."""
+    low, high = ax.get_ylim()
+    steps = (1.0, 2.0, 5.0) if high < FEW_DECADES * low else (1.0,)
+    ax.yaxis.set_major_locator(LogLocator(subs=steps))
+    ax.yaxis.set_major_formatter(FormatStrFormatter("%g"))
+    ax.yaxis.set_minor_formatter(NullFormatter())
 
 
 def name_ticks(axis: Axis, places: Iterable[float], names: Sequence[str]) -> None:

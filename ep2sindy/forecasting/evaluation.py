@@ -35,6 +35,7 @@ from ep2sindy.signals.attractor import follow_phase
 from ep2sindy.signals.spectrum import DECAYED, dominant_frequency
 
 N_REST = 16  # samples of a record from which rest points are looked for
+IN_PHASE = 0.25  # periods, by which a run that is in phase may be ahead or behind
 NEUTRAL = 1e-6  # growth per turn of a perturbation from a rest point that neither grows nor decays
 # Distance of two rest points, in standard deviations: Newton's method ends short of multiple roots.
 APART = 1e-2
@@ -149,7 +150,7 @@ class Evaluation:
             return float("nan")
         if self._slip is None:
             return 0.0
-        off = np.flatnonzero(np.abs(self._slip) > 0.25)
+        off = np.flatnonzero(np.abs(self._slip) > IN_PHASE)
         last = off[0] if off.size else len(self._slip) - 1
         return float((record.t[last] - record.t[0]) * record.cycle.frequency_Hz)
 

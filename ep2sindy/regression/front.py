@@ -20,7 +20,7 @@ from ep2sindy.runtime.values import check_count
 
 
 @dataclass(frozen=True)
-class LeftOver:
+class Residual:
     """Residuals of one equation on its rows, whitened by the noise that propagates into them.
 
     chi_squared: per row, 1 if the residuals are nothing but noise. autocorrelation: of the
@@ -60,7 +60,7 @@ class Candidate:
     deviance: float | None = None
     score: float = float("nan")
     covariance: Float[np.ndarray, "support support"] | None = None
-    left: LeftOver | None = None
+    left: Residual | None = None
 
     @staticmethod
     def of(equation: str, coef: Mapping[str, float], deviance: float | None = None) -> Candidate:

@@ -12,6 +12,7 @@ from enum import Flag, auto
 from math import isfinite
 from typing import Any, Generic, TypeVar
 
+import numpy as np
 import pandas as pd
 
 from ep2sindy.library.units import SECONDS, Clock
@@ -72,6 +73,8 @@ class Metric(Generic[Record]):
         """A value formatted for reading."""
         if callable(self.format):
             return self.format(value)
+        if isinstance(value, bool | np.bool_):
+            return "yes" if value else "no"
         if not self.format:
             return value
         return "-" if value is None or value != value else self.format.format(value)

@@ -170,7 +170,7 @@ def at_once(function: Callable[[], Any]) -> Any:
 
 
 @dataclass(frozen=True, eq=False)
-class KeptWorkers:
+class CachedWorkers:
     """Workers whose finished pieces are kept in a folder, and read back by a run that continues.
 
     A piece is named by the number of the call of `run` that it belongs to, and by its own: the
@@ -220,7 +220,7 @@ def run_alike(
     The first piece is then done in this process, and the others too if they would take less time
     than the start of the processes.
     """
-    if isinstance(workers, KeptWorkers):
+    if isinstance(workers, CachedWorkers):
         kept = workers.keeping(function)
         yield from run_alike(workers.workers, kept, enumerate(pieces), n_pieces)
         return

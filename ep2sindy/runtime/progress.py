@@ -82,7 +82,7 @@ def _layout(total: int | None, unit: str, label: str) -> str:
 
 
 @dataclass(frozen=True)
-class Stated:
+class CallbackProgress:
     """Progress that is passed to a function, which receives the number of finished pieces."""
 
     advance: Advance
@@ -93,7 +93,7 @@ class Stated:
         return nullcontext(self.advance)
 
 
-SILENT = Stated(nothing)
+SILENT = CallbackProgress(nothing)
 
 
 def is_watched() -> bool:
@@ -105,7 +105,7 @@ def as_progress(progress: Progress | Advance | bool) -> Progress:
     """Convert to a Progress: True gives bars, False none; a function receives finished pieces."""
     if isinstance(progress, bool):
         return Bars() if progress else SILENT
-    return progress if isinstance(progress, Progress) else Stated(progress)
+    return progress if isinstance(progress, Progress) else CallbackProgress(progress)
 
 
 def count_pieces(

@@ -16,7 +16,7 @@ from ep2sindy.refinement.windows import MIN_SAMPLES, WindowBatch, dominant_windo
 from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.selection.criteria import FLOOR, MAX_ERROR
 from ep2sindy.selection.systems import (
-    Confirmed,
+    ConfirmedSystem,
     Fold,
     Segment,
     Trial,
@@ -125,10 +125,10 @@ class WindowsLeftOut:
         fractions = np.where(errors > bound, np.minimum(errors / bound, MAX_ERROR), 0.0)
         return np.column_stack([fractions, unknown, unknown, errors, errors])
 
-    def confirm(self, trial: Trial, model: SparseModel) -> Confirmed:
+    def confirm(self, trial: Trial, model: SparseModel) -> ConfirmedSystem:
         """A system is confirmed if its coefficients, refined on all data, meet the demands."""
         broken = trial.system.broken(model)
-        return Confirmed(trial, model, broken, fraction=float(not broken))
+        return ConfirmedSystem(trial, model, broken, fraction=float(not broken))
 
 
 def _residuals(

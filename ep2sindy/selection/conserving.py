@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ep2sindy.data.coerce import Task, noise_inside
+from ep2sindy.data.coerce import DiscoveryProblem, noise_inside
 from ep2sindy.data.numbers import column_norms
 from ep2sindy.library.relations import Place, Process
 from ep2sindy.library.roles import Roles, constraint_of, fractions_of
@@ -24,7 +24,12 @@ Support = tuple[np.ndarray, np.ndarray]  # indices of processes, and their coeff
 
 
 def search_conserving_systems(
-    problems: Sequence[RegressionRows], task: Task, roles: Roles, search: Search, *, depth: int
+    problems: Sequence[RegressionRows],
+    task: DiscoveryProblem,
+    roles: Roles,
+    search: Search,
+    *,
+    depth: int,
 ) -> Systems:
     """The systems that a search proposes for all equations at once, smallest first.
 
@@ -71,7 +76,7 @@ def search_conserving_systems(
 
 def _join_rows(
     problems: Sequence[RegressionRows],
-    task: Task,
+    task: DiscoveryProblem,
     processes: Sequence[Process],
     known: Mapping[Place, float],
 ) -> tuple[Float[np.ndarray, "rows processes"], Float[np.ndarray, " rows"]]:
@@ -128,7 +133,7 @@ def _keep_first(supports: Sequence[Support], depth: int) -> list[Support]:
 
 
 def _build_system(
-    task: Task,
+    task: DiscoveryProblem,
     roles: Roles,
     processes: Sequence[Process],
     values: Float[np.ndarray, " processes"],
@@ -143,7 +148,9 @@ def _build_system(
     return TrialSystem.of(task, held, fractions_of(held) @ values + stated, means)
 
 
-def _average_terms(task: Task, processes: Sequence[Process]) -> Float[np.ndarray, " processes"]:
+def _average_terms(
+    task: DiscoveryProblem, processes: Sequence[Process]
+) -> Float[np.ndarray, " processes"]:
     """Mean of the term of every process over the records."""
     library = task.library
     values = [noise_inside(library, run.columns(library.variables)) for run in task.runs]
@@ -152,7 +159,7 @@ def _average_terms(task: Task, processes: Sequence[Process]) -> Float[np.ndarray
 
 
 def _add_fronts(
-    systems: Sequence[TrialSystem], problems: Sequence[RegressionRows], task: Task
+    systems: Sequence[TrialSystem], problems: Sequence[RegressionRows], task: DiscoveryProblem
 ) -> Systems:
     """The systems with a front per equation, which holds each of their supports once."""
     rows = {state: problem for problem in problems for state in problem.equations}

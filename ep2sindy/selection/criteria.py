@@ -12,7 +12,7 @@ from typing import ClassVar, Literal, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ep2sindy.data.coerce import Task
+from ep2sindy.data.coerce import DiscoveryProblem
 from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Constraint, Relation, binding
 from ep2sindy.model.model import SparseModel
@@ -75,7 +75,9 @@ class Selection(Protocol):
     @property
     def basis(self) -> Basis: ...
 
-    def decide(self, fronts: Fronts, task: Task, *, progress: Progress = SILENT) -> Decision: ...
+    def decide(
+        self, fronts: Fronts, task: DiscoveryProblem, *, progress: Progress = SILENT
+    ) -> Decision: ...
 
 
 # Least residual squares, as a fraction of the target's squares: below this value a criterion would
@@ -128,7 +130,7 @@ class EBIC:
         return replace(self, gamma=self.gamma / n_points)
 
     def decide(
-        self, fronts: Fronts, task: Task | None = None, *, progress: Progress = SILENT
+        self, fronts: Fronts, task: DiscoveryProblem | None = None, *, progress: Progress = SILENT
     ) -> Decision:
         with progress.stage(None, "", f"candidates by {self.label}"):
             return Decision([self._score(front) for front in fronts])
@@ -203,7 +205,7 @@ class Evidence:
     basis: ClassVar[Basis] = "likelihood"
 
     def decide(
-        self, fronts: Fronts, task: Task | None = None, *, progress: Progress = SILENT
+        self, fronts: Fronts, task: DiscoveryProblem | None = None, *, progress: Progress = SILENT
     ) -> Decision:
         deviances = [[candidate.deviance for candidate in front.candidates] for front in fronts]
         return Decision([np.array(values, dtype=np.float64) for values in deviances])
@@ -244,7 +246,7 @@ class Knee:
         return "d_log" if self.scale == "log" else "d_pareto"
 
     def decide(
-        self, fronts: Fronts, task: Task | None = None, *, progress: Progress = SILENT
+        self, fronts: Fronts, task: DiscoveryProblem | None = None, *, progress: Progress = SILENT
     ) -> Decision:
         with progress.stage(None, "", f"candidates by {self.label}"):
             return Decision([self._score(front) for front in fronts])

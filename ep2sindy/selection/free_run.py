@@ -10,7 +10,7 @@ from typing import ClassVar
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.data.coerce import Task
+from ep2sindy.data.coerce import DiscoveryProblem
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.forecasting.evaluation import Evaluation, evaluate
@@ -36,7 +36,7 @@ from ep2sindy.runtime.values import check_kind, check_list, set_counts
 from ep2sindy.selection.by_windows import WindowsLeftOut
 from ep2sindy.selection.criteria import MAX_ERROR, Basis, Decision
 from ep2sindy.selection.systems import (
-    Confirmed,
+    ConfirmedSystem,
     Fold,
     Segment,
     Systems,
@@ -142,7 +142,9 @@ class FreeRunScore:
             raise ValueError(f"margin must lie between 0 and 1, got {self.margin}")
         check_list("assessed", self.assessed)
 
-    def decide(self, fronts: Fronts, task: Task, *, progress: Progress = SILENT) -> Decision:
+    def decide(
+        self, fronts: Fronts, task: DiscoveryProblem, *, progress: Progress = SILENT
+    ) -> Decision:
         """Score candidates by the deviations of their combinations, and refine the winner.
 
         Raises ValueError for a state without a front, records that are too short, or relations
@@ -218,9 +220,9 @@ class FreeRunScore:
         measure: Measure,
         runs: Sequence[Trajectory],
         progress: Progress,
-    ) -> list[Confirmed]:
+    ) -> list[ConfirmedSystem]:
         """The systems, refined on all data in order, up to one that nothing after it can outdo."""
-        found: list[Confirmed] = []
+        found: list[ConfirmedSystem] = []
         best = ranked[: self.n_confirmed]
         for trial in count_pieces(progress, best, "system", "refined on all data"):
             attracting = [each for each in found if each.fraction]
@@ -353,7 +355,7 @@ class CycleRuns:
         worst: np.ndarray = np.max(tried, axis=0)
         return worst
 
-    def confirm(self, trial: Trial, model: SparseModel) -> Confirmed:
+    def confirm(self, trial: Trial, model: SparseModel) -> ConfirmedSystem:
         """Free run of a refined system over the longest record, from the start of its cycle."""
         pairs = zip(self.runs, self.cycles, strict=True)
         longest, cycle = max(pairs, key=lambda pair: np.ptp(pair[0].t))
@@ -362,7 +364,7 @@ class CycleRuns:
             model, longest, initial=start, bounds=self.bounds, assessed=self.rule.assessed
         )
         fraction, repels = _attraction(run) if run.status is Status.SUSTAINED else (0.0, False)
-        return Confirmed(trial, model, trial.system.broken(model), fraction, run, repels)
+        return ConfirmedSystem(trial, model, trial.system.broken(model), fraction, run, repels)
 
 
 def _attraction(run: Evaluation) -> tuple[float, bool]:

@@ -9,7 +9,7 @@ from typing import Unpack
 import numpy as np
 from jaxtyping import Float, Int
 
-from ep2sindy.data.coerce import Task
+from ep2sindy.data.coerce import DiscoveryProblem
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.forecasting.evaluation import Evaluation
 from ep2sindy.library.library import Library
@@ -63,7 +63,7 @@ class TrialSystem:
 
     @staticmethod
     def of(
-        task: Task,
+        task: DiscoveryProblem,
         held: Constraint,
         free: Float[np.ndarray, " free"],
         means: Float[np.ndarray, " processes"] | None = None,
@@ -151,7 +151,7 @@ class Systems:
         ]
 
 
-def combine(fronts: Fronts, task: Task, *, most: int) -> Systems:
+def combine(fronts: Fronts, task: DiscoveryProblem, *, most: int) -> Systems:
     """The combinations of candidates as systems, the most promising if there are more than `most`.
 
     Raises ValueError for relations that no combination has the terms for.
@@ -161,7 +161,9 @@ def combine(fronts: Fronts, task: Task, *, most: int) -> Systems:
     return Systems(fronts, places, systems, describe_left_out(fronts, len(places), most))
 
 
-def _combine_one(fronts: Fronts, choice: Int[np.ndarray, " fronts"], task: Task) -> TrialSystem:
+def _combine_one(
+    fronts: Fronts, choice: Int[np.ndarray, " fronts"], task: DiscoveryProblem
+) -> TrialSystem:
     """System of one combination: free coefficients as found, the others by the relations."""
     support = support_of(fronts, choice)
     held = constraint(task.library, support, binding(task.relations, support) or ())
@@ -342,7 +344,7 @@ def order_equals(ranked: Sequence[Trial]) -> list[Trial]:
 
 
 @dataclass(frozen=True, eq=False)
-class Confirmed:
+class ConfirmedSystem:
     """A system refined on all data, and its free run over the longest record.
 
     broken: demands that the coefficients do not meet. fraction: of starts around the cycle that
@@ -368,7 +370,7 @@ class Confirmed:
         is_sustained = self.run is not None and self.run.status is Status.SUSTAINED
         return is_sustained and not self.fraction and not self.repels
 
-    def outdoes(self, resting: Confirmed) -> bool:
+    def outdoes(self, resting: ConfirmedSystem) -> bool:
         """Whether an attracting system is preferred to one that is no larger, on a neutral cycle.
 
         It is if it follows the windows better, or as an equal: of one size, and as close to the

@@ -131,7 +131,7 @@ def add_balance(
     name: of the library. data: samples of the processes. cycle: of the model; without one there is
     no figure.
     """
-    report.section(f"{name}: what the terms mean", level=3)
+    report.section(f"{name}: terms as physical processes", level=3)
     if found.processes:
         title = "what is exchanged, in record and model"
         rows = ResultTable(found.processes, PROCESSES)

@@ -17,7 +17,7 @@ from ep2sindy.estimation.estimate import Estimate, Rival
 from ep2sindy.figures.fronts import front_figure
 from ep2sindy.library.equations import equation_text
 from ep2sindy.library.units import Clock
-from ep2sindy.regression.front import Candidate, LeftOver, ParetoFront
+from ep2sindy.regression.front import Candidate, ParetoFront, Residual
 from ep2sindy.report.document import Equation, Table, Text
 from ep2sindy.report.report import Report
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View
@@ -67,7 +67,7 @@ class CandidateRow:
 
     candidate: Candidate
     is_selected: bool = False
-    left: LeftOver | None = None
+    left: Residual | None = None
     lead: str = ""
 
     @property
@@ -126,7 +126,7 @@ def add_candidates(
     """
     library, label = found.model.library, found.method.selection.label
     words = f"{len(library)} terms in {', '.join(library.variables)}; selection: "
-    report.section(f"{name}: candidates", f"{words}{found.method.selection}")
+    report.section(f"{name}: candidate equations", f"{words}{found.method.selection}")
     report.summary.setdefault("notes", {})[name] = note
     report.add(
         *([f"selected: {note}"] if note else []), *(f"note: {n}" for n in found.data_warnings)
@@ -233,7 +233,7 @@ def add_estimate(report: Report, name: str, found: Discovery) -> None:
     """
     estimate = found.estimate
     assert estimate is not None
-    report.section(f"{name}: what the samples say", level=3)
+    report.section(f"{name}: noise of the samples, and other supports", level=3)
     if not found.noise_test.tested:
         report.add(Text(REPLACED, warning=True))
     rows = ResultTable([estimate], ESTIMATE)

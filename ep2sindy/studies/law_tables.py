@@ -226,7 +226,7 @@ def add_law(
         )
         _add_left_out(report, found)
         shown.append(Text(_add_map(report, found, points, labels)))
-    report.section("Model and order")
+    report.section("Structures and laws compared")
     bold = [k for k, trial in enumerate(found.trials) if trial is choice]
     report.table("trials", ResultTable(found.trials, _metrics(found)), note=TRIED, bold=bold)
     middle = found.records[most_central(choice.fits.points)]
@@ -287,7 +287,7 @@ def _add_left_out(report: Report, found: FoundLaw) -> None:
         Metric("f_kHz", lambda p: 1e-3 * p.record.cycle.frequency_Hz),
         *(metric.of(lambda p: p.run, view=View.SHOWN) for metric in EVALUATION),
     ]
-    report.section("Points left out")
+    report.section("Prediction of points left out")
     report.table("left_out", ResultTable(found.runs, metrics), note=LEFT_OUT)
     left_out = report.tables["left_out"]
     if left_out["f_error"].notna().any():
@@ -313,7 +313,7 @@ def _add_map(
     does = (points["status"] == Oscillation.OSCILLATING).to_numpy()
     report.headline["map_right"] = float((says == does).mean())
     parameters, table = list(found.records[0].parameters), pd.DataFrame([p.row for p in found.map])
-    report.section("Where it oscillates")
+    report.section("Where the model oscillates")
     report.samples("map", table)
     if any(point.status is Status.SUSTAINED for point in found.map):
         draw = partial(

@@ -12,6 +12,7 @@ import numpy as np
 import xarray as xr
 
 from ep2sindy.data.quantities import KNOWN_UNITS
+from ep2sindy.data.sampling import ZoneAverage
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.method import AnyMethod, Regression, of_means
@@ -46,7 +47,6 @@ from ep2sindy.studies.library_result import (
 )
 from ep2sindy.studies.processes import NO_ZONES, Zones
 from ep2sindy.studies.source import (
-    Sampling,
     Source,
     columns_beside,
     n_before,
@@ -83,7 +83,7 @@ class LibraryCase:
     function_degree: int = 1
     n_norm: str | None = None
 
-    def library(self, data: xr.Dataset, sampling: Sampling, more: Sequence[str] = ()) -> Library:
+    def library(self, data: xr.Dataset, sampling: ZoneAverage, more: Sequence[str] = ()) -> Library:
         """The library over the data's variables, and over more, which the data lack."""
         optional = [name for name in self.variables_if_present if name in data]
         names = [*sampling.columns([*self.variables, *optional]), *more]

@@ -15,7 +15,7 @@ from ep2sindy.data.run_files import FilePattern
 from ep2sindy.data.steps import files_of
 from ep2sindy.report.report import Report
 from ep2sindy.runtime.files import fingerprint
-from ep2sindy.runtime.parallel import ONE_BY_ONE, KeptWorkers, Workers
+from ep2sindy.runtime.parallel import ONE_BY_ONE, CachedWorkers, Workers
 from ep2sindy.runtime.user_cache import cache_folder
 from ep2sindy.trust.user_code import PACKAGE, nodes_of, own_source
 
@@ -76,7 +76,7 @@ def _files_named(settings: object) -> Iterator[str]:
 @contextmanager
 def resumed(
     keep: bool, report: Report, workers: Workers = ONE_BY_ONE, *, aside: Collection[str] = ()
-) -> Iterator[KeptWorkers]:
+) -> Iterator[CachedWorkers]:
     """Workers that continue with the pieces that an interrupted run left in the user's cache.
 
     keep: False begins anew and keeps nothing. aside: see `pieces_key`.
@@ -91,7 +91,7 @@ def resumed(
     if folder is not None and folder.exists():
         report.say("going on with the pieces that a broken run had finished")
     try:
-        yield KeptWorkers(workers, folder)
+        yield CachedWorkers(workers, folder)
     except KeyboardInterrupt:
         if folder is not None:
             report.say("finished pieces are kept: the same command continues with them")

@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -70,31 +70,13 @@ def _prepared(data: Deferred, prepare: Sequence[Step]) -> xr.Dataset:
     return field.assign_attrs(stated | field.attrs)
 
 
-@runtime_checkable
-class Sampling(Protocol):
-    """How a field becomes a trajectory. states and products are attributes of the method."""
-
-    states: Sequence[str]
-    products: Sequence[str]
-
-    def trajectory(self, field: xr.Dataset, *, inputs: Sequence[str], label: str) -> Trajectory: ...
-
-    def columns(self, names: Sequence[str]) -> list[str]:
-        """What variables are called in the trajectory: of several zones, each has its own."""
-        ...
-
-    def place(self, field: xr.Dataset) -> str:
-        """The place on the field's grid, in words; empty for a field without a grid."""
-        ...
-
-
 @dataclass(frozen=True, eq=False)
 class Source:
-    """A field, the steps that prepare it, and the method that makes a trajectory of it."""
+    """A field, the steps that prepare it, and the zones that make a trajectory of it."""
 
     data: Deferred
     prepare: Sequence[Step]
-    trajectory: Sampling
+    trajectory: ZoneAverage
 
     @property
     def states(self) -> list[str]:
@@ -134,18 +116,16 @@ class Source:
 
 
 def zone_of(source: Source) -> Zone | None:
-    """The zone that the trajectory is averaged over; None for the whole field or a point of it."""
-    return source.trajectory.zone if isinstance(source.trajectory, ZoneAverage) else None
+    """The zone that the trajectory is averaged over; None for the whole field."""
+    return source.trajectory.zone
 
 
 def zones_of(source: Source, field: xr.Dataset, report: Report) -> Zones:
-    """The zones that the trajectory is averaged over; none if it is that of a point.
+    """The zones that the trajectory is averaged over.
 
     Balances that cannot be made, as of a zone that reaches into the plume, are reported.
     """
     sampling = source.trajectory
-    if not isinstance(sampling, ZoneAverage):
-        return Zones()
     return Zones(_balances(sampling, field, report), sampling.sizes(field))
 
 
@@ -153,7 +133,7 @@ def _balances(sampling: ZoneAverage, field: xr.Dataset, report: Report) -> dict[
     if not {IONS, NEUTRALS} <= set(field.data_vars):
         return {}
     zones = sampling.parts(field)
-    if any(zone.r is not None for zone in zones.values()):
+    if any(zone.r is not None or isinstance(zone.z, float) for zone in zones.values()):
         return {}
     try:
         axisymmetric = sampling.axisymmetric

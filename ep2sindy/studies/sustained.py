@@ -187,7 +187,7 @@ def add_sustained(report: Report, name: str, found: SustainedModel) -> None:
     """Add the model, how it runs, and how the choice of derivatives does; name: of the library."""
     model, clock, run = found.model, found.run.rollout.clock, found.run
     held_to = found.discovery.constraint
-    report.section(f"{name}: a model selected by free runs ({run.text})")
+    report.section(f"{name}: the model that free runs select ({run.text})")
     report.model(f"{name}_sustained", model, clock=clock, held=held_to, shown=False)
     report.add(*model_blocks(model, clock, held=held_to, words=SPREAD, note=SPREAD_NOTE))
     if run.cycle is not None:

@@ -12,7 +12,7 @@ import pandas as pd
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.figures import series
-from ep2sindy.forecasting.evaluation import Evaluation, size_text
+from ep2sindy.forecasting.evaluation import IN_PHASE, Evaluation, size_text
 from ep2sindy.forecasting.skill import ForecastSkill
 from ep2sindy.library.relations import Constraint
 from ep2sindy.model.comparison import Status
@@ -43,6 +43,9 @@ CAPTIONS = {
 }
 
 
+HARMONICS = 20.0  # of the largest dominant frequency, up to which spectra are drawn
+
+
 @dataclass(frozen=True)
 class PlotRange:
     """The range that figures show: the start of a record, and the low end of spectra."""
@@ -54,7 +57,11 @@ class PlotRange:
         return self.duration_s or float(data.t[-1] - data.t[0])
 
     def up_to_Hz(self, data: Trajectory) -> float:
-        return self.f_max_Hz or 0.5 / data.dt_s
+        """The end of spectra: harmonics of the fastest state, up to half the sampling rate."""
+        if self.f_max_Hz:
+            return self.f_max_Hz
+        peaks = [dominant_frequency(data.t, column) for column in data.states.T]
+        return min(0.5 / data.dt_s, HARMONICS * float(np.nanmax([0.0, *peaks])) or np.inf)
 
 
 def add_samples(report: Report, data: Trajectory, runs: Mapping[str, Evaluation]) -> None:
@@ -212,10 +219,17 @@ def run_words(run: Evaluation) -> str:
     if waveforms:
         found.append(f"waveform within {max(waveforms):.2g} standard deviations")
     if np.isfinite(run.periods):
-        found.append(f"in phase for {round(run.periods)} periods")
+        found.append(f"in phase for {round(run.periods)} periods{_lag_words(run.phase_end)}")
     if not found and np.isfinite(run.nrmse):
         found.append(f"{size_text(run.nrmse, '.2g')} standard deviations off")
     return "; ".join(found) or run.text
+
+
+def _lag_words(ahead: float) -> str:
+    """`, 0.12 of a period behind at the end`; empty if a run has lost the phase."""
+    if not abs(ahead) <= IN_PHASE:
+        return ""
+    return f", {abs(ahead):.2g} of a period {'ahead' if ahead > 0.0 else 'behind'} at the end"
 
 
 def _size(ratio: float) -> str:

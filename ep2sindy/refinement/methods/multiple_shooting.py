@@ -93,13 +93,13 @@ class MultipleShooting:
             finite=np.ones(n_points, dtype=np.bool_),
             step=self.step,
         )
-        walk, points = _Walk(problem, start), np.arange(n_points)
-        for memory in self.memories(walk.window):
-            walk.remember(memory, points)
+        iterate, points = _Path(problem, start), np.arange(n_points)
+        for memory in self.memories(iterate.window):
+            iterate.remember(memory, points)
         for _ in range(problem.n_reweights):
-            walk.stage(walk.window, points, tolerance=1e-2, max_iter=self.max_iter)
-            walk.weights = residual_weights(walk.nodes, problem.data)
-        return self._finish(walk, points)
+            iterate.stage(iterate.window, points, tolerance=1e-2, max_iter=self.max_iter)
+            iterate.weights = residual_weights(iterate.nodes, problem.data)
+        return self._finish(iterate, points)
 
     def finer(
         self, problem: RefinementProblem, fit: RefinementFit, points: np.ndarray
@@ -107,7 +107,7 @@ class MultipleShooting:
         """Continue some points of a fit from their present state, with half the time step."""
         step = fit.step.halved()
         return (
-            None if step is None else self._finish(_Walk(problem, replace(fit, step=step)), points)
+            None if step is None else self._finish(_Path(problem, replace(fit, step=step)), points)
         )
 
     def memories(self, window: int) -> list[int]:
@@ -118,14 +118,14 @@ class MultipleShooting:
             size *= self.growth
         return [*memories, window] if memories else []
 
-    def _finish(self, walk: _Walk, points: np.ndarray) -> RefinementFit:
-        walk.stage(walk.window, points, tolerance=self.tolerance, max_iter=self.max_iter)
-        walk.join(points)
-        walk.note_memory(walk.window, points)
-        return walk.result()
+    def _finish(self, iterate: _Path, points: np.ndarray) -> RefinementFit:
+        iterate.stage(iterate.window, points, tolerance=self.tolerance, max_iter=self.max_iter)
+        iterate.join(points)
+        iterate.note_memory(iterate.window, points)
+        return iterate.result()
 
 
-class _Walk:
+class _Path:
     """A fit on its way, whose arrays change in place, with the one-step maps at its nodes.
 
     memory: (points,), the longest one of a stage that left no gaps, at least one sample. damping:

@@ -148,7 +148,7 @@ class Rows:
     series: Float[np.ndarray, "time series"]
 
     @staticmethod
-    def room(n_rows: int, grid: MaskedGrid) -> Rows:
+    def allocate(n_rows: int, grid: MaskedGrid) -> Rows:
         """Arrays for n_rows samples; planes are NaN in the thruster's body."""
         return Rows(
             np.full((len(PLANES), n_rows, grid.n_z, grid.n_r), np.nan, np.float32),
@@ -182,11 +182,11 @@ def warmed_up_run(
 ) -> Rows:
     """The samples after the warm-up; if the warm-up diverges, its last finite samples."""
     state = initial_state(grid, model)
-    rows = Rows.room(min(n_warm_up, CHUNK_ROWS), grid)
+    rows = Rows.allocate(min(n_warm_up, CHUNK_ROWS), grid)
     broken = warm_up(rows.march(state, model, sample_s, averaged), n_warm_up, stated)
     if broken is not None:
         return rows.until(broken)
-    rows = Rows.room(n_samples, grid)
+    rows = Rows.allocate(n_samples, grid)
     return rows.until(
         record_samples(rows.march(state, model, sample_s, averaged), n_samples, stated)
     )
