@@ -1,6 +1,5 @@
 """Tables that are no text: Excel, Parquet, TDMS, and arrays whose names hold their units."""
 
-from importlib import util
 from pathlib import Path
 
 import numpy as np
@@ -103,13 +102,6 @@ def test_durations_are_times(tmp_path: Path) -> None:
     assert clock_of(field) == run.clock == ep.library.Clock.of("h")
 
 
-def test_dates_that_may_be_read_in_two_ways_are_left_out(tmp_path: Path) -> None:
-    (tmp_path / "a.csv").write_text("date,x\n01/02/2024,1\n02/02/2024,3\n03/02/2024,2\n")
-    found = ep.inspect_file(tmp_path / "a.csv")
-    assert "left out: date; dates are read if written as 2024-01-31" in found.source.words
-    assert list(found.variables) == ["x"]
-
-
 def test_columns_of_several_sheets_bear_the_sheets_name(tmp_path: Path) -> None:
     with pd.ExcelWriter(tmp_path / "a.xlsx") as book:
         TABLE.to_excel(book, sheet_name="one", index=False)
@@ -122,17 +114,6 @@ def test_columns_of_several_sheets_bear_the_sheets_name(tmp_path: Path) -> None:
         time=ep.data.Variable("two/Time", "us"),
     )
     np.testing.assert_allclose(field["I_d"].values, 1e-3 * X, rtol=1e-12)
-
-
-@pytest.mark.parametrize("name", ["a.parquet"])
-def test_a_missing_extra_is_named(
-    tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    KINDS[name](tmp_path / name)
-    monkeypatch.setattr("ep2sindy.data.readers.registry.find_spec", lambda package: None)
-    assert util.find_spec("pandas")  # the patch is of that module's name alone
-    with pytest.raises(ValueError, match=r"an extra reads: pip install 'ep2sindy\[files\]', or"):
-        ep.inspect_file(tmp_path / name)
 
 
 @pytest.mark.parametrize("part", [0.3, 0.6, 0.9])
@@ -166,12 +147,8 @@ X_Value\tVoltage\tComment
 """
 
 
-def test_a_measurement_file_of_labview_asks_for_its_time_alone(tmp_path: Path) -> None:
+def test_a_measurement_file_of_labview_is_read(tmp_path: Path) -> None:
     rows = "".join(f"{t:.7f}\t{x:.6f}\t\n" for t, x in zip(T, X, strict=True))
     (tmp_path / "a.lvm").write_text(LVM + rows)
-    with pytest.raises(
-        ValueError, match=r"if 'X_Value' is time, 'data.time=\{name:X_Value,unit:UN"
-    ):
-        ep.open_field(tmp_path / "a.lvm")
     field = ep.open_field(tmp_path / "a.lvm", time=ep.data.Variable("X_Value", "s"))
     np.testing.assert_allclose(field["Voltage"].values, X, atol=1e-6)
