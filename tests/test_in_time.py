@@ -7,7 +7,6 @@ import pytest
 import xarray as xr
 
 import ep2sindy as ep
-from ep2sindy.data.gaps import describe_breaks, present_rows
 
 T = np.sort(np.random.default_rng(2).uniform(0.0, 1.0, 400))
 T[[0, -1]] = 0.0, 1.0
@@ -116,9 +115,6 @@ def test_detrending_takes_a_polynomial_out_and_keeps_the_mean(degree: int) -> No
     [
         (ep.data.resample, {"dt_s": 2.0},
          "leave two samples or more, got 2 s for a record of 1 s"),
-        (ep.data.delay, {"variable": "q", "delay_s": 0.1},
-         r"unknown variable .*'q'; .*\['x', 'I_d'\]"),
-        (ep.data.delay, {"variable": "x", "delay_s": -0.1}, "delay_s must be positive"),
         (ep.data.delay, {"variable": "x", "delay_s": 0.1, "name": "I_d"},
          "a new name: the field already has 'I_d'"),
         (ep.data.detrend, {"degree": 0}, "degree must be 1 or more, .*, got 0"),
@@ -127,12 +123,6 @@ def test_detrending_takes_a_polynomial_out_and_keeps_the_mean(degree: int) -> No
 def test_steps_say_what_they_cannot_do(step: object, settings: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         step(plane(T), **settings)
-
-
-def test_a_step_takes_a_field_and_no_trajectory() -> None:
-    run = ep.lotka_volterra().trajectory()
-    with pytest.raises(ValueError, match=r"must be an xarray\.Dataset, .*, got Trajectory"):
-        ep.data.crop(run, start_s=5.0)
 
 
 def test_steps_that_need_every_sample_name_a_gap() -> None:
@@ -160,18 +150,3 @@ def test_a_state_without_a_number_is_named() -> None:
     field["x"].values[:] = np.nan
     with pytest.raises(ValueError, match="x must hold numbers: all its 11 samples are NaN"):
         ep.zone_average(field, None, states=["x", "y"])
-
-
-def test_samples_that_no_row_holds_together_are_named() -> None:
-    t = np.arange(6.0)
-    x, y = np.where(t < 3, t, np.nan), np.where(t >= 2, t, np.nan)
-    with pytest.raises(ValueError, match="of 6 samples x lacks 3, y lacks 2, and 1 are left"):
-        present_rows({"x": x, "y": y})
-
-
-def test_gaps_in_the_times_themselves_are_counted() -> None:
-    t = 1e-6 * np.array([*range(20), *range(60, 80), *range(200, 220)])
-    assert describe_breaks(t).startswith(
-        "the record has 2 gaps: 0.000121 s pass after sample 40, at 7.9e-05 s, where steps"
-    )
-    assert not describe_breaks(t[:20])

@@ -52,7 +52,7 @@ def set_up(*, plane=False, **changes):
 
 def rows_of(n_rows, grid):
     """Room for samples of the state, as the kernels take it."""
-    rows = Rows.room(n_rows, grid)
+    rows = Rows.allocate(n_rows, grid)
     return [*rows.planes, rows.profiles, rows.series]
 
 

@@ -6,7 +6,6 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from shutil import copytree
 
 import pytest
 
@@ -59,20 +58,15 @@ def test_what_kernels_import_compiles_them_again_too() -> None:
 
 CALL = """
 import sys
-from pathlib import Path
-from ep2sindy.runtime import compilation
 sys.path.insert(0, sys.argv[1])
-compilation.SHARED = Path(sys.argv[2])
 import my_kernels
 """
 
 
-def called(
-    folder: Path, *, shared: Path = Path("/none"), **environment: str
-) -> subprocess.CompletedProcess[str]:
+def called(folder: Path, **environment: str) -> subprocess.CompletedProcess[str]:
     """Run a kernel that calls another, by a process of its own."""
     return subprocess.run(
-        [sys.executable, "-c", CALL, str(folder), str(shared)],
+        [sys.executable, "-c", CALL, str(folder)],
         env=os.environ | environment, capture_output=True, text=True, check=True,
     )  # fmt: skip
 
@@ -93,15 +87,12 @@ def kernels(tmp_path: Path) -> Path:
 def test_a_kernel_is_kept_where_one_may_write_and_follows_what_it_calls(
     kernels: Path, tmp_path: Path
 ) -> None:
-    cache, shared = str(tmp_path / "cache"), tmp_path / "shared"
+    cache = str(tmp_path / "cache")
     first = called(kernels, EP2SINDY_CACHE=cache)
     assert (first.stdout, first.stderr) == ("5.0\n", f"{compilation.ANNOUNCEMENT}\n")
     assert list((tmp_path / "cache" / "kernels").rglob("*.nbi"))
-    # As in a container, whose image an administrator has warmed.
-    copytree(tmp_path / "cache" / "kernels", shared)
-    for settings in ({"EP2SINDY_CACHE": cache}, {"EP2SINDY_CACHE": "/dev/null", "shared": shared}):
-        again = called(kernels, **settings)
-        assert (again.stdout, again.stderr) == ("5.0\n", "")
+    again = called(kernels, EP2SINDY_CACHE=cache)
+    assert (again.stdout, again.stderr) == ("5.0\n", "")
     inner = kernels / "inner.py"
     inner.write_text(inner.read_text().replace("x + 1.0", "x + 1.25"))
     assert called(kernels, EP2SINDY_CACHE=cache).stdout == "5.5\n"

@@ -37,10 +37,29 @@ MASSES = {"xenon": M_XENON, "krypton": M_KRYPTON, "argon": M_ARGON}
 def propellant(name: str, *, coulomb_weight: float = 1.0) -> PropellantTable:
     """A gas that comes with the package: xenon, krypton, argon, or xenon_5eV.
 
-    Xenon and krypton are the tables of HallThruster.jl, for T_e up to 170 and 100 eV, with ions
-    of up to three charges. Argon is computed from the cross sections of Phelps & Petrovic (1999),
-    up to 100 eV. Each file in `gases/` names its sources. xenon_5eV has the ionisation table of the
-    stored runs of HallThruster.jl v0.22, linear over 5 eV. The default `XenonFits` are formulas.
+    Parameters
+    ----------
+    name : str
+        Name of the gas.
+    coulomb_weight : float, default 1.0
+        Factor on the frequency of Coulomb collisions.
+
+    Returns
+    -------
+    PropellantTable
+        Tables of its rates, linear between their rows.
+
+    Raises
+    ------
+    ValueError
+        If the gas is unknown.
+
+    Notes
+    -----
+    Xenon and krypton are the tables of HallThruster.jl, for T_e up to 170 and 100 eV, with ions of
+    up to three charges. Argon is computed from the cross sections of Phelps & Petrovic (1999), up
+    to 100 eV. xenon_5eV has the ionization table of the stored runs of HallThruster.jl v0.22,
+    linear over 5 eV. Each file in `gases/` names its sources. The default `XenonFits` are formulas.
     """
     if name == "xenon_5eV":
         return _resample_ionization(propellant("xenon", coulomb_weight=coulomb_weight), name)
@@ -81,14 +100,36 @@ def read_propellant(
     third_ionization_eV: float | None = None,
     name: str | None = None,
 ) -> PropellantTable:
-    """Read a user's gas from a CSV file whose header names the columns.
+    """Read a gas of your own from a CSV file whose header names the columns.
 
-    Columns: T_e_eV or mean_energy_eV (which is 1.5 T_e), increasing; ionization, excitation and
-    momentum, rate coefficients in m^3/s; for a second charge double_ionization (X -> X2+) and
-    second_ionization (X+ -> X2+), for a third triple_ionization (X -> X3+), ion_double_ionization
-    (X+ -> X3+) and third_ionization (X2+ -> X3+). Lines that begin with # are ignored. mass_u: mass
-    of the atom in atomic mass units. The energies are an electron's loss per event, in eV.
-    Raises ValueError for a missing file, a missing or unknown column, or a gap.
+    Parameters
+    ----------
+    path : str or Path
+        The file. Its columns are T_e_eV or mean_energy_eV (which is 1.5 T_e), increasing;
+        ionization, excitation and momentum, rate coefficients in m^3/s; for a second charge
+        double_ionization (X -> X2+) and second_ionization (X+ -> X2+); for a third
+        triple_ionization (X -> X3+), ion_double_ionization (X+ -> X3+) and third_ionization (X2+ ->
+        X3+). Lines that begin with # are ignored.
+    mass_u : float
+        Mass of the atom in atomic mass units.
+    ionization_eV, excitation_eV : float
+        Energy that an electron loses per event, in eV.
+    double_ionization_eV, second_ionization_eV : float, optional
+        The same for the second charge, if the file has its columns.
+    triple_ionization_eV, ion_double_ionization_eV, third_ionization_eV : float, optional
+        The same for the third charge, if the file has its columns.
+    name : str, optional
+        Name of the gas. None takes that of the file.
+
+    Returns
+    -------
+    PropellantTable
+        Tables of its rates, linear between their rows.
+
+    Raises
+    ------
+    ValueError
+        If the file or a column is missing, a column is unknown, or there is a gap.
     """
     given = {
         "ionization_eV": ionization_eV,

@@ -85,12 +85,26 @@ def coulomb_rate(T_e_eV: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class XenonFits:
-    """Xenon coefficients as published formulas (Goebel & Katz, appendix E and chapter 3).
+    """Xenon coefficients as published formulas.
 
     Inelastic rates are evaluated at the electrons' total mean energy 1.5 T_e + K, where K is the
-    kinetic energy of their drift, that is at T_e + 2 K/3; with `drift_weight` 0, at T_e. The whole
-    energy of an event is taken from the heat: drag along the field becomes heat whatever its cause,
-    and the drift energy, which follows the field at once, is not stored.
+    kinetic energy of their drift, that is at T_e + 2 K/3. The whole energy of an event is taken
+    from the heat: drag along the field becomes heat whatever its cause, and the drift energy, which
+    follows the field at once, is not stored.
+
+    Parameters
+    ----------
+    drift_weight : float, default 1.0
+        Factor on K. With 0 the rates are evaluated at T_e.
+
+    Raises
+    ------
+    ValueError
+        If the weight is negative.
+
+    Notes
+    -----
+    Source: Goebel & Katz, appendix E and chapter 3.
     """
 
     drift_weight: float = 1.0
