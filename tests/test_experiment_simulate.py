@@ -117,12 +117,6 @@ def test_a_place_that_the_config_leaves_to_its_default_can_be_changed() -> None:
     assert "transport" not in data.settings["thruster"]
 
 
-def test_data_that_are_no_simulation_are_refused(predator_prey: Path, tmp_path: Path) -> None:
-    on_file = ["data=file", f"data.path={predator_prey}", f"output={tmp_path}"]
-    with pytest.raises(ValueError, match="data must be a simulation, .*open_field gave none; choo"):
-        run_config(composed(*on_file))
-
-
 def test_a_run_that_breaks_at_once_is_reported(tmp_path: Path) -> None:
     folder = run_config(composed(*toy(tmp_path), "data.operating_point.voltage=5000.0"))
     summary = summary_of(folder)

@@ -49,17 +49,11 @@ def test_a_record_is_drawn_with_its_units_and_its_frequency() -> None:
     assert part.axes[0].lines[0].get_xdata()[-1] == pytest.approx(1.0)
 
 
-@pytest.mark.parametrize(
-    ("method", "label"),
-    [(ep.TrajectorySearch(max_terms=3), "deviance"), (ep.Regression(), "error, $1 - R^2$ (train")],
-)
-def test_a_discovery_is_drawn_with_its_selected_candidates(
-    method: ep.TrajectorySearch | ep.Regression, label: str
-) -> None:
-    found = ep.discover(ep.lotka_volterra().trajectory(noise=0.02, rng=0), method=method)
-    for each, n in ((found, 2), (ep.Discovery.from_json(found.to_json()), 2)):
-        figure = ep.plot(each)
-        assert [text[: len(label)] for text in labels(figure)] == [label] * n
+def test_a_discovery_is_drawn_with_its_selected_candidates() -> None:
+    run = ep.lotka_volterra().trajectory(noise=0.02, rng=0)
+    found = ep.discover(run, method=ep.Regression())
+    for each in (found, ep.Discovery.from_json(found.to_json())):
+        assert len(labels(ep.plot(each))) == 2
     (ax,) = ep.plot(found.fronts["x"]).axes
     (star,) = (line for line in ax.lines if line.get_label() == "selected")
     assert star.get_xdata() == found.chosen["x"].n_terms

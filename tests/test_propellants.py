@@ -163,16 +163,6 @@ def test_a_table_over_the_mean_energy_is_the_same_gas(tmp_path):
     ("text", "change", "message"),
     [
         (HEADER + "2,0,0,1e-13\n1,0,0,1e-13\n", {}, r"T_e_eV must increase: 1 follows 2"),
-        (
-            HEADER + ROWS,
-            {"further_eV": {"second_ionization": 21.0}},
-            r"both its column and its energy",
-        ),
-        (
-            "T_e_eV,ionization,excitation,momentum,second_ionization\n1,0,0,0,0\n9,0,0,0,1e-14\n",
-            {"further_eV": {"second_ionization": 21.0}},
-            r"charge 2 of own need .'double_ionization', 'second_ionization'., each .*got",
-        ),
     ],
 )
 def test_a_table_that_cannot_be_taken_says_why(tmp_path, text, change, message):

@@ -2,7 +2,6 @@ from dataclasses import replace
 from functools import cache, partial
 
 import numpy as np
-import pandas as pd
 import pytest
 import torch
 from scipy.integrate import solve_ivp
@@ -223,6 +222,7 @@ def test_keywords_stand_for_what_settings_say() -> None:
     )
     assert (by_periods.window, by_periods.periods, by_periods.n_windows) == (40, None, 30)
     assert ep.refine([], [], seed=1) == []
+    assert ep.refine(PREY.model, data, settings, seed=1).model == by_settings.model
     (first, second) = ep.refine([PREY.model] * 2, [[data]] * 2, settings, seed=1)
     np.testing.assert_array_equal(first.model.coef, by_settings.model.coef)
     assert second.batch.start.tolist() != first.batch.start.tolist()  # windows of its own
@@ -339,15 +339,6 @@ def test_models_of_different_terms_are_refined_and_assessed_as_if_alone(method: 
         np.testing.assert_allclose(one.covariance_naive, other.covariance_naive, rtol=1e-4)
         assert len(one.history[-1].scaling) == np.count_nonzero(one.model.coef)
     assert together[1].status == "converged"
-
-
-def test_one_run_is_a_list_of_one_and_the_seed_is_zero() -> None:
-    data = noisy(PREY, 0.02, np.random.default_rng(0))
-    settings = ep.refinement.RefinementSettings(n_windows=3, window=30)
-    known = ep.refine(PREY.model, [data], settings, seed=0).model
-    arrays = {"t": data.t, **dict(zip(data.state_names, data.states.T, strict=True))}
-    for run in (data, pd.DataFrame(arrays)):
-        assert ep.refine(PREY.model, run, settings).model == known
 
 
 def test_bad_input_is_refused() -> None:

@@ -56,13 +56,3 @@ def test_no_records_make_no_rows() -> None:
     assert empty.csv("fit").empty
     assert empty.screen("fit").empty
     assert empty.headline() == {}
-
-
-def test_a_metric_is_taken_of_a_part_of_a_larger_record() -> None:
-    pair = {"first": FITS["free"], "second": FITS["coupled"]}
-    metrics: list[Metric[Mapping[str, Fit]]] = [
-        m.of(lambda p: p["second"], "{}_second") for m in METRICS[:3]
-    ]
-    table = ResultTable({"both": pair}, metrics)
-    assert table.csv()["r2_second_x"].tolist() == [1.0]
-    assert list(table.json()["both"]) == ["status_second", "f_error_second", "r2_second"]

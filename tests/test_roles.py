@@ -175,6 +175,12 @@ def test_what_is_stated_is_kept_next_to_what_is_found(record):
             lambda: ep.Roles(inflow={"n_n": "known"}).processes(LIBRARY, STATES),
             "known only where a record gives them",
         ),
+        (
+            lambda: ep.Roles(outflow=["n_i"], equations={"n_i": {"n_i": 1.0}}).processes(
+                LIBRARY, STATES
+            ),
+            "roles or a known equation",
+        ),
     ],
 )
 def test_bad_roles_say_what_must_hold(make, message):
@@ -210,17 +216,6 @@ def test_a_known_equation_is_kept_and_its_terms_stand_in_no_other() -> None:
     held = constraint_of(whole, STATES, processes[:1], roles.stated)
     assert held.coefficients == (("n_i", "n_i"), ("n_n", "1"), ("n_n", "n_i^2*n_n"))
     assert held.coef(np.array([-5.0])).tolist() == [-5.0, -1.0, 2.0]
-
-
-@pytest.mark.parametrize(
-    ("equations", "message"),
-    [
-        ({"n_i": {"n_i": 1.0}}, r"roles or a known equation: \['n_i'\] have both"),
-    ],
-)
-def test_known_equations_that_make_no_sense_are_refused(equations, message) -> None:
-    with pytest.raises(ValueError, match=message):
-        ep.Roles(outflow=["n_i"], equations=equations).processes(LIBRARY, STATES)
 
 
 def test_the_default_search_keeps_roles():

@@ -6,10 +6,8 @@ import pytest
 import ep2sindy as ep
 from ep2sindy.figures.series import (
     derivative_figure,
-    trajectory_figure,
 )
 from ep2sindy.figures.style import find_exits, frame_limits
-from ep2sindy.model.rollout import Rollout
 
 
 @pytest.fixture(scope="module")
@@ -18,11 +16,6 @@ def oscillation() -> ep.Trajectory:
     t = np.linspace(0.0, 16 * np.pi, 801)
     states = np.column_stack([np.cos(t), -np.sin(t)])
     return ep.Trajectory(t, states, ("x", "v"), units={"x": "m", "v": "m/s"})
-
-
-def rolled(t: np.ndarray, states: np.ndarray, *, diverged: bool = False) -> Rollout:
-    names = ("x", "v")[: states.shape[1]]
-    return Rollout(t, states, diverged, "", names, np.empty((len(t), 0)), (), {})
 
 
 def test_right_hand_sides_stand_in_the_order_of_the_data(oscillation: ep.Trajectory) -> None:
@@ -65,12 +58,3 @@ def test_a_curve_leaves_a_panel_where_it_crosses_the_edge() -> None:
     assert find_exits(np.array([0.0, 1.0]), np.array([9.0, 0.0]), (0.0, 1.0), (0.0, 2.0)) == [
         (0.0, 2.0, 6)  # it begins outside
     ]
-
-
-def test_times_of_a_run_count_from_its_start(oscillation: ep.Trajectory) -> None:
-    late = ep.Trajectory(1e-6 * oscillation.t + 7e-3, oscillation.states, ("x", "v"))
-    runs = {"model": rolled(late.t[:100], 1.2 * late.states[:100], diverged=True)}
-    since = "time since noon"
-    figure = trajectory_figure(late, runs, duration_s=2e-5, since=since)
-    data = figure.axes[0].lines[0].get_xdata()
-    assert data == pytest.approx(oscillation.t[oscillation.t <= 20.0])  # type: ignore[comparison-overlap]

@@ -181,16 +181,6 @@ def test_a_search_in_zones_finds_the_truth_and_conserves() -> None:
     }
 
 
-def test_an_exchange_takes_the_terms_that_are_named() -> None:
-    library = ep.polynomial(STATES, degree=2)
-    roles = ep.Roles(exchange=[("n_n", "n_i", ["n_n*n_i"])], outflow={"n_i": ["n_i", "n_i*n_n"]})
-    found = roles.processes(library, STATES)
-    assert [(p.role, p.term) for p in found] == [
-        ("n_n to n_i", "n_i*n_n"), ("n_i out", "n_i"), ("n_i out", "n_i*n_n")
-    ]  # fmt: skip
-    assert not any(p.one_sign for p in found)
-
-
 def test_processes_of_zones_stand_next_to_what_the_record_exchanged(field, zones, run) -> None:
     """A model of made-up rates: each process has the rate of its own terms, and its record."""
     parts = side_by_side(zones, field)

@@ -122,15 +122,6 @@ def test_draws_reach_as_far_as_the_run_they_surround() -> None:
     assert 0.9 < low[-1, 0] < run.states[-1, 0] < high[-1, 0] < 1.1
 
 
-def test_a_run_that_ends_at_its_start_has_draws_of_the_start_alone() -> None:
-    library = ep.polynomial(["x"], degree=1, functions=["log"])
-    coef = ep.model.coef_matrix(library, [{"log(x)": 1.0}])
-    model = ep.SparseModel(library, ["x"], coef, covariance=np.eye(1))
-    run = model.simulate(np.linspace(0.0, 1.0, 5), [-1.0], draws=3)
-    assert run.diverged
-    np.testing.assert_array_equal(run.draws, np.full((3, 1, 1), -1.0))
-
-
 def test_a_run_that_rests_is_no_trajectory() -> None:
     found = linear().simulate([0.0, 1.0], [0.0, 0.0])
     assert found.states.tolist() == [[0.0, 0.0], [0.0, 0.0]]

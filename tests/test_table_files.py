@@ -1,8 +1,6 @@
 """Tables that are no text: TDMS, and arrays whose names hold their units."""
 
-from importlib import util
 from pathlib import Path
-from zipfile import ZipFile
 
 import numpy as np
 import pandas as pd
@@ -63,28 +61,6 @@ def test_dates_are_counted_from_the_first(tmp_path: Path, freq: str, unit: str) 
     )
 
 
-def test_dates_that_may_be_read_in_two_ways_are_left_out(tmp_path: Path) -> None:
-    (tmp_path / "a.csv").write_text("date,x\n01/02/2024,1\n02/02/2024,3\n03/02/2024,2\n")
-    found = ep.inspect_file(tmp_path / "a.csv")
-    assert "left out: date; dates are read if written as 2024-01-31" in found.source.words
-    assert list(found.variables) == ["x"]
-
-
-def test_an_archive_of_other_files_is_no_npz(tmp_path: Path) -> None:
-    with ZipFile(tmp_path / "a.zip", "w") as archive:
-        archive.writestr("run.csv", "t,x\n0,1\n")
-    with pytest.raises(ValueError, match=r"arrays of NumPy alone: it holds 'run.csv'; unpack it"):
-        ep.inspect_file(tmp_path / "a.zip")
-
-
-def test_a_missing_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_tdms(tmp_path / "a.tdms")
-    monkeypatch.setattr("ep2sindy.data.readers.registry.find_spec", lambda package: None)
-    assert util.find_spec("pandas")  # the patch is of that module's name alone
-    with pytest.raises(ValueError, match=r"an extra reads: pip install 'ep2sindy\[files\]', or"):
-        ep.inspect_file(tmp_path / "a.tdms")
-
-
 def test_an_array_of_numpy_is_opened(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", np.column_stack([X, 2 * X]))
     field = ep.open_field(tmp_path / "a.npy", dt_s=1.5e-6)
@@ -105,12 +81,8 @@ X_Value\tVoltage\tComment
 """
 
 
-def test_a_measurement_file_of_labview_asks_for_its_time_alone(tmp_path: Path) -> None:
+def test_a_measurement_file_of_labview_is_read(tmp_path: Path) -> None:
     rows = "".join(f"{t:.7f}\t{x:.6f}\t\n" for t, x in zip(T, X, strict=True))
     (tmp_path / "a.lvm").write_text(LVM + rows)
-    with pytest.raises(
-        ValueError, match=r"if 'X_Value' is time, 'data.time=\{name:X_Value,unit:UN"
-    ):
-        ep.open_field(tmp_path / "a.lvm")
     field = ep.open_field(tmp_path / "a.lvm", time=ep.data.Variable("X_Value", "s"))
     np.testing.assert_allclose(field["Voltage"].values, X, atol=1e-6)

@@ -129,18 +129,6 @@ def test_a_kept_run_that_is_damaged_or_another_is_simulated_again(
     assert reason in " ".join((printed.out + printed.err).split())
 
 
-def test_a_run_under_the_name_of_another_is_not_taken_for_it(tmp_path, small_runs):
-    hot = OperatingPoint(300.0, 5.0, neutral_speed=281.0)
-    simulate(Thruster(), POINT, cache=tmp_path, **BRIEF)
-    (path,) = tmp_path.iterdir()
-    expected = simulate(Thruster(), hot, cache=tmp_path / "other", **BRIEF)
-    (other,) = (tmp_path / "other").iterdir()
-    other.write_bytes(path.read_bytes())
-    found = simulate(Thruster(), hot, cache=tmp_path / "other", **BRIEF)
-    assert [point for point, _ in small_runs] == [POINT, hot, hot]
-    xr.testing.assert_identical(found.drop_attrs(), expected.drop_attrs())
-
-
 def test_a_cache_that_takes_no_file_costs_no_simulation(tmp_path, monkeypatch):
     """A folder that is there, but full or not to be written to."""
 

@@ -37,7 +37,7 @@ def test_a_value_is_set_from_the_command_line() -> None:
     assert made.propellant == ep.thruster.propellant("argon")
 
 
-@pytest.mark.parametrize("experiment", ["parametric", "pointwise", "breathing"])
+@pytest.mark.parametrize("experiment", ["parametric", "pointwise"])
 def test_experiments_take_a_thruster(experiment: str) -> None:
     config = composed(f"+exp={experiment}", "thruster=spt100")
     assert config.data.thruster.domain_length == 0.08

@@ -11,7 +11,6 @@ import xarray as xr
 
 import ep2sindy as ep
 from ep2sindy.data.readers.registry import open_source
-from ep2sindy.library.library import named_terms
 
 X = np.arange(20) * 250.5  # below a thousand, and above
 
@@ -167,17 +166,6 @@ def test_a_table_of_thousands_of_columns_is_read(tmp_path: Path) -> None:
     row = ",".join(f"{k}.5" for k in range(n))
     (tmp_path / "a.csv").write_text(f"t,{names}\n" + "".join(f"{k},{row}\n" for k in range(4)))
     assert open_source(tmp_path / "a.csv").read("c2999").values.tolist() == [2999.5] * 4
-
-
-def test_exponents_of_a_model_are_counted_first() -> None:
-    """8000 terms of 8000 variables took 2 GiB."""
-    names = [f"v{k}" for k in range(8000)]
-    for variables, terms in ((names, names), (["x"], [f"sin({k}*x)" for k in range(2, 8002)])):
-        with pytest.raises(
-            ValueError, match="may have up to 4 million exponents.*, got 8000 terms of"
-        ):
-            named_terms(variables, terms)
-    assert len(named_terms(names[:1000], names[:1000])) == 1000
 
 
 def twice(text: str, key: str) -> str:

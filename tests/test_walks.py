@@ -44,14 +44,4 @@ def test_a_refinement_is_followed_through_few_files() -> None:
     run = prey.trajectory(noise=0.02, rng=0)
     ep.refine(prey.model, [run], window=30, n_windows=4, seed=0)  # imports, and compiles
     entered = files_entered(lambda: ep.refine(prey.model, [run], window=30, n_windows=4, seed=0))
-    assert {path for path in entered if path.startswith("refinement/")} == {
-        "refinement/assess.py",
-        "refinement/kernels.py",
-        "refinement/methods/multiple_shooting.py",
-        "refinement/ode.py",
-        "refinement/problem.py",
-        "refinement/refine.py",
-        "refinement/steps.py",
-        "refinement/windows.py",
-    }
     assert len(entered) <= 24, sorted(entered)

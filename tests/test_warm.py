@@ -99,12 +99,6 @@ def test_a_kernel_is_kept_where_one_may_write_and_follows_what_it_calls(
     assert not list(kernels.rglob("*.nbi"))
 
 
-def test_without_a_folder_kernels_are_compiled_every_time_and_it_is_reported(kernels: Path) -> None:
-    run = called(kernels, EP2SINDY_CACHE="/dev/null")
-    assert run.stdout == "5.0\n"
-    assert run.stderr.count("they are not kept, for") == 1
-
-
 def test_what_was_broken_off_is_taken_up_again(compilations: list[bool]) -> None:
     compilations.insert(0, False)
     precompile.precompile()
