@@ -452,23 +452,56 @@ def resample(field: xr.Dataset, *, dt_s: float) -> xr.Dataset:
 def interpolate(field: xr.Dataset, *, max_gap_s: float | None = None) -> xr.Dataset:
     """Fill missing samples (NaN) by linear interpolation in time.
 
-    max_gap_s: longest gap to fill, measured between the samples on either side; None fills all.
-    Longer gaps, and those at an end of the record, stay. Loads the field.
+    The field is loaded.
+
+    Parameters
+    ----------
+    field : Dataset
+        Field over time.
+    max_gap_s : float, optional
+        Longest gap to fill, measured between the samples on either side, in s. None fills all.
+
+    Returns
+    -------
+    Dataset
+        The field without missing samples.
+
+    Raises
+    ------
+    ValueError
+        If a gap is longer, or lies at an end of the record.
     """
-    t, filled = grid_points(field, "time"), {}
+    t = grid_points(field, "time")
+    filled = {}
     for name in _of_time(field):
         array = _time_first(field[name])
-        values, absent = array.values.copy(), np.isnan(array.values)
-        for cell in np.argwhere(absent.any(axis=0) & ~absent.all(axis=0)):
+        values = array.values.copy()
+        absent = np.isnan(values)
+        some = absent.any(axis=0) & ~absent.all(axis=0)
+        for cell in np.argwhere(some):
             place = (slice(None), *cell)
-            present = t[~absent[place]]
-            values[place] = np.interp(t, present, values[place][~absent[place]], np.nan, np.nan)
-            if max_gap_s is not None:
-                after = np.clip(np.searchsorted(present, t), 1, len(present) - 1)
-                is_long = present[after] - present[after - 1] > max_gap_s
-                values[place][absent[place] & is_long] = np.nan
-        filled[name] = array.copy(data=values)
+            present = np.flatnonzero(~absent[place])
+            _check_gaps(str(name), t, present, max_gap_s)
+            values[place] = np.interp(t, t[present], values[place][present])
+        if some.any():
+            filled[name] = array.copy(data=values)
     return field.assign(filled)
+
+
+def _check_gaps(name: str, t: np.ndarray, present: np.ndarray, max_gap_s: float | None) -> None:
+    if present[0] > 0 or present[-1] < len(t) - 1:
+        raise ValueError(
+            f"only gaps inside the record can be filled: {name} holds numbers from "
+            f"{t[present[0]]:.6g} to {t[present[-1]]:.6g} s, the record runs from {t[0]:.6g} to "
+            f"{t[-1]:.6g} s; crop it first (ep2sindy.data.crop)"
+        )
+    gaps = np.diff(t[present])
+    if max_gap_s is not None and gaps.max() > max_gap_s:
+        k = int(gaps.argmax())
+        raise ValueError(
+            f"gaps must not exceed max_gap_s = {max_gap_s:g} s: {name} is missing from "
+            f"{t[present[k]]:.6g} to {t[present[k + 1]]:.6g} s; crop the record there"
+        )
 
 
 def derivative(field: xr.Dataset, *, variable: str, name: str | None = None) -> xr.Dataset:

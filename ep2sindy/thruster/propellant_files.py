@@ -109,13 +109,32 @@ def read_propellant(
 ) -> PropellantTable:
     """Read a gas of your own from a CSV file whose header names the columns.
 
-    Columns: T_e_eV or mean_energy_eV (which is 1.5 T_e), increasing; ionization, excitation and
-    momentum, rate coefficients in m^3/s; for a second charge double_ionization (X -> X2+) and
-    second_ionization (X+ -> X2+), for a third triple_ionization (X -> X3+), ion_double_ionization
-    (X+ -> X3+) and third_ionization (X2+ -> X3+). Lines that begin with # are ignored. mass_u: mass
-    of the atom in atomic mass units. The energies are an electron's loss per event, in eV; those of
-    higher charges stand in further_eV, by column.
-    Raises ValueError for a missing file, a missing or unknown column, or a gap.
+    Parameters
+    ----------
+    path : str or Path
+        The file. Its columns are T_e_eV or mean_energy_eV (which is 1.5 T_e), increasing;
+        ionization, excitation and momentum, rate coefficients in m^3/s; for a second charge
+        double_ionization (X -> X2+) and second_ionization (X+ -> X2+); for a third
+        triple_ionization (X -> X3+), ion_double_ionization (X+ -> X3+) and third_ionization (X2+ ->
+        X3+). Lines that begin with # are ignored.
+    mass_u : float
+        Mass of the atom in atomic mass units.
+    ionization_eV, excitation_eV : float
+        Energy that an electron loses per event, in eV.
+    further_eV : Mapping, optional
+        The same for higher charges, by column of the file: `{"double_ionization": 33.1, ...}`.
+    name : str, optional
+        Name of the gas. None takes that of the file.
+
+    Returns
+    -------
+    PropellantTable
+        Tables of its rates, linear between their rows.
+
+    Raises
+    ------
+    ValueError
+        If the file or a column is missing, a column is unknown, or there is a gap.
     """
     first = {"ionization_eV": ionization_eV, "excitation_eV": excitation_eV}
     path = Path(path)
