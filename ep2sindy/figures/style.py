@@ -52,7 +52,6 @@ OFF_SCALE, STOPS = "off scale", "diverged"
 
 SIGN = "#555555"  # colour of legend marks, which stand for marks of any colour
 
-
 FEW_DECADES = 100.0  # ratio of the ends of a logarithmic axis with ticks inside its decades
 
 N_LINE = 60  # points on the line of a law

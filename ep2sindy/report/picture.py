@@ -31,7 +31,7 @@ class Drawn:
 
 
 def draw(figure: Figure, png: bytes, caption: str) -> Drawn:
-    """A figure for a page, of its PNG."""
+    """A figure for a page, by its PNG."""
     width = round(figure.get_size_inches()[0] * PX_PER_INCH)
     return Drawn(png_html(in_few_colours(png) if len(png) > LARGE else png), caption, width)
 
