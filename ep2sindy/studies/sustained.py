@@ -6,7 +6,6 @@ of a report.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -25,18 +24,17 @@ from ep2sindy.model.comparison import FreeRunBounds
 from ep2sindy.model.mass_action import consequences
 from ep2sindy.model.model import SparseModel
 from ep2sindy.regression.searches import Search
-from ep2sindy.report.document import Table
 from ep2sindy.report.models import model_blocks
 from ep2sindy.report.report import Report
-from ep2sindy.report.results import Metric, Metrics, ResultTable, View, percent
+from ep2sindy.report.results import Metric, Metrics
 from ep2sindy.runtime.progress import SILENT, Progress
-from ep2sindy.selection.criteria import OtherSystem, Selection
+from ep2sindy.selection.criteria import Selection
 from ep2sindy.signals.attractor import find_cycle, mean_cycle, white_variance
 from ep2sindy.signals.smoothers import KalmanSmoother
 from ep2sindy.signals.spectrum import power_spectrum, samples_in_periods
 from ep2sindy.studies.processes import NO_ZONES, TELLING, Zones, stated_roles
 from ep2sindy.studies.study import Count, Positive
-from ep2sindy.studies.views import CYCLE, add_samples, terms_text
+from ep2sindy.studies.views import CYCLE, add_samples
 
 WAVEFORM = "One period by phase, shown twice: samples, their waveform, and the model's."
 CAPTIONS = {
@@ -50,13 +48,6 @@ SPREAD = "spread over windows"  # of the coefficients: no knowledge of a rate
 SPREAD_NOTE = (
     "Spread over windows: 95 % intervals by how the windows of the refinement differ; they do not "
     "say how far off the model itself is."
-)
-MOST_OTHERS = 12  # shown on the page
-OTHERS_NOTE = (
-    "Largest errors over the parts of the record that a model was not fitted to; deviation: the "
-    "largest of the three in units of the bounds of a self-sustained model. All stay within "
-    "them: what "
-    "these models have in common is what the record tells."
 )
 
 
@@ -174,13 +165,6 @@ SUSTAINED_MODEL: Metrics[SustainedModel] = [
     Metric("lack_of_fit", lambda found: found.discovery.lack_of_fit),
     Metric("refinement_by_derivatives", lambda found: found.refinement),
 ]
-OTHERS: Metrics[OtherSystem] = [
-    Metric("terms", lambda each: terms_text(each.terms), View.SHOWN),
-    Metric("f_error", lambda each: each.f_error, View.SHOWN, "frequency", percent(2)),
-    Metric("amplitude_error", lambda each: each.amplitude, View.SHOWN, "amplitude", percent(1)),
-    Metric("waveform_error", lambda each: each.waveform, View.SHOWN, "waveform", "{:.3f}"),
-    Metric("deviation", lambda each: each.deviation, View.SHOWN, format="{:.2f}"),
-]
 
 
 def add_sustained(report: Report, name: str, found: SustainedModel) -> None:
@@ -198,7 +182,6 @@ def add_sustained(report: Report, name: str, found: SustainedModel) -> None:
     report.add(*_notes(found))
     add_cycle(report, name, run)
     add_samples(report, run.record, {f"{name}_sustained": run})
-    _add_others(report, name, found.discovery.others)
 
 
 def add_cycle(report: Report, name: str, run: Evaluation) -> None:
@@ -211,17 +194,6 @@ def add_cycle(report: Report, name: str, run: Evaluation) -> None:
     if figures.find_waveforms(run.record, run.rollout):
         draw = partial(figures.waveform_figure, run.record, run.rollout)
         report.figure(f"waveform_{name}", draw, CAPTIONS["waveform"])
-
-
-def _add_others(report: Report, name: str, others: Sequence[OtherSystem]) -> None:
-    """Add the other self-sustained systems of this size: whether the found one is the law."""
-    if not others:
-        return
-    more = f"; the first {MOST_OTHERS} of {len(others)}" if len(others) > MOST_OTHERS else ""
-    title = f"other models of as many coefficients that are sustained where not fitted{more}"
-    rows = ResultTable(others[:MOST_OTHERS], OTHERS).screen()
-    shown = Table(rows, title=title, note=OTHERS_NOTE, page_only=True)
-    report.table(f"sustained_others_{name}", ResultTable(others, OTHERS), shown=shown)
 
 
 def _notes(found: SustainedModel) -> list[str]:
