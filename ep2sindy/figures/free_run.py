@@ -1,4 +1,4 @@
-"""Figures of a model's free run: over the data, on its limit cycle, and by phase."""
+"""Figures of a model's free run: over the data, on its limit cycle, and by process."""
 
 from __future__ import annotations
 
@@ -14,17 +14,13 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.figures import style
 from ep2sindy.figures.style import COLOURS, DATA, GREY, TITLE, WIDTH
 from ep2sindy.library.units import Clock
-from ep2sindy.model.comparison import LONG
 from ep2sindy.model.rollout import Rollout, simulate
 from ep2sindy.model.stability import LimitCycle
-from ep2sindy.signals.attractor import Cycle, best_shift, find_cycle
 
 PERIODS = 6.0  # periods shown at either end of a record
 
 STARTS = (0.3, 0.6, 1.4, 0.6, 1.4)  # distance from the cycle's middle, relative to its states
 N_PERIODS = 12.0  # duration of a run from such a start, in periods
-
-PHASES = np.linspace(0.0, 2.0, 257)  # two periods, in periods
 
 
 def free_run_figure(run: Trajectory, rollout: Rollout, *, period_s: float) -> Figure:
@@ -98,41 +94,6 @@ def paths_off(cycle: LimitCycle) -> list[Rollout]:
     t = np.linspace(0.0, N_PERIODS * cycle.period_s, 1200)
     reach = np.abs(cycle.states).max(axis=0)
     return [simulate(cycle.model, t, start, None, blow_up=30.0, reach=reach) for start in starts]
-
-
-def waveform_figure(run: Trajectory, rollout: Rollout) -> Figure:
-    """A panel per state: samples by phase, their waveform, and the model's, over two periods."""
-    found = find_waveforms(run, rollout)
-    assert found is not None
-    data, model = found
-    figure, axes = style.make_grid(len(run.state_names), width=4.2, height=3.0, extra=0.5)
-    ours = data.waveform(2.0 * np.pi * PHASES)
-    theirs = model.waveform(2.0 * np.pi * PHASES + best_shift(data, model))
-    phase = np.mod(data.phase / (2.0 * np.pi), 1.0)
-    for k, (ax, name) in enumerate(zip(axes, run.state_names, strict=True)):
-        for shift in (0.0, 1.0):
-            ax.plot(phase + shift, run.states[:, k], ".", ms=1.0, color=GREY, rasterized=True)
-        ax.plot(PHASES, ours[:, k], color=DATA, lw=1.6, label="data")
-        ax.plot(PHASES, theirs[:, k], color=COLOURS[0], lw=1.4, ls="--", label="model")
-        ax.set(xlabel="phase (periods)", ylabel=style.axis_label(name, run.units[name]))
-        ax.set_xlim(0.0, 2.0)
-    samples = Line2D([], [], color=GREY, marker=".", ls="none", label="samples")
-    style.legend_above(figure, [samples, *axes[0].lines[-2:]])
-    return figure
-
-
-def find_waveforms(run: Trajectory, rollout: Rollout) -> tuple[Cycle, Cycle] | None:
-    """Waveforms of the data and of the model's run; None if one of them is not periodic.
-
-    Transients of a long run are left out.
-    """
-    data = find_cycle(run.t, run.states)
-    if data is None:
-        return None
-    half = len(rollout.t) // 2 if data.n_periods >= LONG else 0
-    late = rollout.states[half:, [rollout.state_names.index(name) for name in run.state_names]]
-    model = find_cycle(rollout.t[half:], late, n_harmonics=len(data.harmonics))
-    return None if model is None else (data, model)
 
 
 def balance_figure(

@@ -157,8 +157,7 @@ def attractor_figure(found: Sequence[Identified], *, over_time: bool = False) ->
     """A column per system, a row per noise level: samples, truth and identified model.
 
     Panels show the plane of the first and the last state; with over_time, the first state over
-    time. Carets mark where a model leaves the panel; a cross marks where a diverged run stops
-    inside it.
+    time.
     """
     systems = list(dict.fromkeys(each.system for each in found))
     noises = sorted({each.noise for each in found})
@@ -181,7 +180,7 @@ def attractor_figure(found: Sequence[Identified], *, over_time: bool = False) ->
         ax.set_title(f"{SYSTEM_LABELS.get(system, system)}\n{ax.get_title()}", fontsize=TITLE)
     for ax, noise in zip(axes[:, 0], noises, strict=True):
         ax.set_ylabel(f"noise {100 * noise:g} %\n\n{ax.get_ylabel()}")
-    style.legend_curves(figure, list(axes.flat), n=3)
+    style.legend_above(figure, axes[0, 0].lines[:3])
     return figure
 
 
@@ -195,7 +194,6 @@ def _draw_one(
     ax.plot(*truth, color=DATA, lw=1.6, label="truth")
     ax.plot(*model, color=IDENTIFIED, lw=1.1, ls=(0, (4, 1.5)), label="identified model")
     ax.set(xlim=limits[0], ylim=limits[1])
-    style.mark_exits(ax, *model, colour=IDENTIFIED, limits=limits, diverged=each.rollout.diverged)
     verdict = "true terms" if each.right else "other terms"
     if each.rollout.diverged:
         verdict += f", {when_it_diverges(each.rollout)}"

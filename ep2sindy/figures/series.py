@@ -66,14 +66,13 @@ def trajectory_figure(
 ) -> Figure:
     """A row per model: its run from the data's first sample (colour) over the data (grey).
 
-    Carets mark where a run leaves the panel; a cross marks where a diverged run stops inside it.
     statuses: by name, how the run goes. since: the origin of the time axis, in words.
     """
     data = first_part(run.t, run.states, duration_s, run.clock)
     models = _runs(rollouts, statuses, duration_s, run.clock)
     titles = [style.axis_label(name, run.units[name]) for name in run.state_names]
     x_label = _time_label(run.clock, duration_s, since)
-    return _draw_rows(data, models, titles, x_label, limits=limits_of(data, models))[0]
+    return _draw_rows(data, models, titles, x_label, limits_of(data, models))
 
 
 def derivative_figure(
@@ -81,7 +80,7 @@ def derivative_figure(
 ) -> Figure:
     """A row per model: its right-hand side on the data (colour), the data's derivative (grey).
 
-    Spikes of the derivative do not set the scale; carets mark where a curve leaves the panel.
+    Spikes of the derivative do not set the scale.
     """
     clock, pieces = run.clock, run.segments()
     slopes = np.concatenate([smoother.derivative(each.t, each.states) for each in pieces])
@@ -95,42 +94,7 @@ def derivative_figure(
         sides.append(replace(curves, label=_label(name)))
     titles = [style.slope_label(name, clock.rate_unit(run.units[name])) for name in run.state_names]
     x_label, limits = _time_label(clock, duration_s), limits_of(data, sides, RARE)
-    return _draw_rows(data, sides, titles, x_label, limits=limits)[0]
-
-
-def spectrum_figure(
-    run: Trajectory,
-    rollouts: Mapping[str, Rollout],
-    *,
-    f_max_Hz: float,
-    statuses: Mapping[str, str] = MappingProxyType({}),
-) -> Figure:
-    """A row per model: power spectra of its run (colour) and of the data of equal length (grey).
-
-    The dashed line marks the data's dominant frequency; each row states its model's.
-    statuses: by name, how the run goes.
-    """
-    n_samples = max(len(rollout.t) for rollout in rollouts.values())
-    data = _spectra(run.t[:n_samples], run.states[:n_samples], f_max_Hz, run.clock)
-    models = [
-        replace(_spectra(r.t, r.states, f_max_Hz, run.clock), label=_run_label(name, r, statuses))
-        for name, r in rollouts.items()
-    ]
-    titles = [
-        f"power of {style.axis_label(name, _power_unit(run, name))}" for name in run.state_names
-    ]
-    figure, axes = _draw_rows(data, models, titles, _frequency_label(run.clock, f_max_Hz))
-    for column, power, values in zip(axes.T, data.y.T, run.states.T, strict=True):
-        peak = run.clock.frequency_scale(f_max_Hz)[0] * dominant_frequency(run.t, values)
-        ends = 0.3 * np.percentile(power, 2), 10.0 * power.max()
-        column[0].set(yscale="log", ylim=ends)
-        for ax in column:
-            ax.axvline(peak, color=DATA, lw=0.8, ls="--")
-    for row, rollout in zip(axes, rollouts.values(), strict=True):
-        for ax, values in zip(row, () if rollout.diverged else rollout.states.T, strict=False):
-            text = run.clock.frequency_text(dominant_frequency(rollout.t, values))
-            ax.text(0.98, 0.82, text, transform=ax.transAxes, ha="right", fontsize=SMALL)
-    return figure
+    return _draw_rows(data, sides, titles, x_label, limits)
 
 
 def _draw_rows(
@@ -138,23 +102,19 @@ def _draw_rows(
     models: Sequence[Curves],
     titles: Sequence[str],
     x_label: str,
-    *,
-    limits: Sequence[Limits] = (),
-) -> tuple[Figure, np.ndarray]:
+    limits: Sequence[Limits],
+) -> Figure:
     """Draw a row per model and a column per state, with the data in grey behind.
 
-    limits: of every column; marks show where curves leave them, and which runs diverged.
+    limits: of every column, which curves may leave.
     """
     height = float(np.clip(5.0 / len(models), 1.05, 2.2))
     size = (WIDTH, height * len(models) + 1.2)
     figure, axes = style.make_panels(len(models), len(titles), size, sharex=True, sharey="col")
     for row, colour, model in zip(axes, cycle(MORE_COLOURS), models, strict=False):
         for k, ax in enumerate(row):
-            frame = (_reach([data.x, model.x]), limits[k]) if limits else None
-            style.draw_over(
-                ax, (data.x, data.y[:, k]), (model.x, model.y[:, k]), colour=colour, limits=frame,
-                diverged=model.stops,
-            )  # fmt: skip
+            style.draw_over(ax, (data.x, data.y[:, k]), (model.x, model.y[:, k]), colour=colour)
+            ax.set_ylim(limits[k])
         text = model.label.replace(", ", ",\n")
         row[0].set_ylabel(text, rotation=0, ha="right", va="center", labelpad=10)
     for ax in axes[1:].flat:  # panels of a column share their axis and so the first row's factor
@@ -162,13 +122,8 @@ def _draw_rows(
     for column, title in zip(axes.T, titles, strict=True):
         column[0].set_title(title, fontsize=TITLE)
     figure.supxlabel(x_label, fontsize=SMALL)  # once: three columns have no width for it
-    style.legend_curves(figure, list(axes.flat))
-    return figure, axes
-
-
-def _reach(parts: Sequence[Float[np.ndarray, " _"]]) -> Limits:
-    together = np.concatenate(parts)
-    return float(together.min()), float(together.max())
+    style.legend_above(figure, axes[0, 0].lines[:1])
+    return figure
 
 
 def _spectra(
@@ -207,13 +162,12 @@ def _power_unit(run: Trajectory, name: str) -> str:
 class Curves:
     """One curve per state over a shared abscissa, scaled to the axis's prefix.
 
-    label: of the panels that show it. stops: whether it is that of a run that diverged at its end.
+    label: of the panels that show it.
     """
 
     x: Float[np.ndarray, " points"]
     y: Float[np.ndarray, "points n_states"]
     label: str = ""
-    stops: bool = False
 
 
 def first_part(
@@ -236,7 +190,6 @@ def _runs(
         replace(
             first_part(run.t, run.states, duration_s, clock),
             label=_run_label(name, run, statuses),
-            stops=run.diverged and run.lasted_s <= duration_s,
         )
         for name, run in rollouts.items()
     ]
@@ -272,7 +225,7 @@ def phase_figure(
 ) -> Figure:
     """A panel per model in the plane of the first two states: its run (colour) over data (grey).
 
-    The dot marks the start; other marks and statuses are as in `trajectory_figure`.
+    The dot marks the start; statuses are as in `trajectory_figure`.
     """
     data = first_part(run.t, run.states, duration_s, run.clock)
     models = _runs(rollouts, statuses, duration_s, run.clock)
@@ -282,21 +235,19 @@ def phase_figure(
     )
     x_limits, y_limits = limits_of(data, models)[:2]
     for ax, colour, model in zip(axes, cycle(MORE_COLOURS), models, strict=False):
-        path, limits = (model.y[:, 0], model.y[:, 1]), (x_limits, y_limits)
         style.draw_over(
-            ax, (data.y[:, 0], data.y[:, 1]), path, colour=colour, limits=limits,
-            diverged=model.stops,
-        )  # fmt: skip
+            ax, (data.y[:, 0], data.y[:, 1]), (model.y[:, 0], model.y[:, 1]), colour=colour
+        )
         ax.plot(*model.y[:1, :2].T, "o", color=colour, ms=4)
         ax.set_title(model.label, fontsize=TITLE, pad=13.0)  # above the ordinate's factor
-    axes[0].set_xlim(x_limits)
+    axes[0].set(xlim=x_limits, ylim=y_limits)
     for ax in axes:
         place = ax.get_subplotspec()
         if place is not None and place.is_first_col():
             ax.set_ylabel(y_label)
             # All panels share the first one's factor.
             ax.yaxis.get_offset_text().set_visible(place.is_first_row())
-    style.legend_curves(figure, axes)
+    style.legend_above(figure, axes[0].lines[:1])
     return figure
 
 

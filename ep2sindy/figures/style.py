@@ -1,6 +1,6 @@
 """Elements shared by all figures: colours, labels and frames.
 
-A frame sets the range of a panel whose curves may leave it, and marks where they do.
+A frame sets the range of a panel whose curves may leave it.
 """
 
 from __future__ import annotations
@@ -44,11 +44,6 @@ Limits = tuple[float, float]
 Curve = tuple[Float[np.ndarray, " _"], Float[np.ndarray, " _"]]  # abscissa, ordinate
 
 Sharing = bool | Literal["row", "col"]
-
-# Caret markers at the edge that a curve crosses: left, right, below, above.
-CARETS = {(0, 0): 4, (0, 1): 5, (1, 0): 7, (1, 1): 6}
-
-OFF_SCALE, STOPS = "off scale", "diverged"
 
 SIGN = "#555555"  # colour of legend marks, which stand for marks of any colour
 
@@ -239,86 +234,10 @@ def frame_limits(
     return bottom - margin, top + margin
 
 
-def find_exits(
-    x: Float[np.ndarray, " points"],
-    y: Float[np.ndarray, " points"],
-    x_limits: Limits,
-    y_limits: Limits,
-) -> list[tuple[float, float, int]]:
-    """Exits of a curve from a panel: (x, y, marker) on the edge that it crosses first.
-
-    A curve that begins outside is marked on the edge, at the point nearest to its first point.
-    """
-    points, limits = np.column_stack([x, y]), np.array([x_limits, y_limits])
-    points = points[np.isfinite(points).all(axis=1)]
-    inside, middle = (
-        ((points >= limits[:, 0]) & (points <= limits[:, 1])).all(axis=1),
-        limits.mean(1),
-    )
-    steps = [(points[k], points[k + 1]) for k in np.flatnonzero(inside[:-1] & ~inside[1:])]
-    if len(points) and not inside[0]:
-        steps.insert(0, (middle, points[0]))
-    found = []
-    for start, end in steps:
-        edge, step = np.clip(end, *limits.T), end - start
-        fractions = np.divide(edge - start, step, out=np.full(2, np.inf), where=edge != end)
-        axis = int(fractions.argmin())
-        place = edge if start is middle else start + fractions[axis] * step
-        place[axis] = edge[axis]
-        found.append((float(place[0]), float(place[1]), CARETS[axis, int(step[axis] > 0.0)]))
-    return found
-
-
-def mark_exits(
-    ax: Axes,
-    x: Float[np.ndarray, " points"],
-    y: Float[np.ndarray, " points"],
-    *,
-    colour: str,
-    limits: tuple[Limits, Limits],
-    diverged: bool = False,
-) -> None:
-    """Draw carets where a curve leaves the panel; a cross where a diverged run stops inside."""
-    for at_x, at_y, marker in find_exits(x, y, *limits):
-        ax.plot(
-            at_x, at_y, marker=marker, ls="none", color=colour, ms=7.0, clip_on=False, zorder=5,
-            label=f"_{OFF_SCALE}",
-        )  # fmt: skip
-    within = len(x) and all(
-        low <= end <= high for end, (low, high) in zip((x[-1], y[-1]), limits, strict=True)
-    )
-    if diverged and within:
-        ax.plot(x[-1], y[-1], "x", color=colour, ms=6, mew=1.6, zorder=5, label=f"_{STOPS}")
-
-
-def draw_over(
-    ax: Axes,
-    data: Curve,
-    model: Curve,
-    *,
-    colour: str = COLOURS[0],
-    limits: tuple[Limits, Limits] | None = None,
-    diverged: bool = False,
-) -> None:
-    """Draw a model over data, which are grey and wider, so that both show where they agree.
-
-    limits: of the panel, from which `mark_exits` takes where the curves leave it. diverged: whether
-    the model's run diverged where its curve ends.
-    """
+def draw_over(ax: Axes, data: Curve, model: Curve, *, colour: str = COLOURS[0]) -> None:
+    """Draw a model over data, which are grey and wider, so that both show where they agree."""
     ax.plot(*data, color=GREY, lw=2.4, label="data")
     ax.plot(*model, color=colour, lw=1.1, label="model")
-    if limits is not None:
-        mark_exits(ax, *data, colour=GREY, limits=limits)
-        mark_exits(ax, *model, colour=colour, limits=limits, diverged=diverged)
-        ax.set_ylim(limits[1])
-
-
-def legend_curves(figure: Figure, axes: Sequence[Axes], n: int = 1) -> None:
-    """Draw a legend of the first panel's first n curves, and of the marks in any panel."""
-    there = {str(line.get_label()) for ax in axes for line in ax.lines}
-    marks = [mark_sign(6, OFF_SCALE), mark_sign("x", STOPS)]
-    shown = [mark for mark in marks if f"_{mark.get_label()}" in there]
-    legend_above(figure, [*axes[0].lines[:n], *shown])
 
 
 def mark_sign(marker: Any, label: str, colour: str = SIGN, **style: Any) -> Line2D:

@@ -87,7 +87,7 @@ CAPTION = (
     "start of its own; frequency error and nrmse of the run, from its first sample (full) "
     "and from a fitted start (dashed). The dotted line marks one period, the grey one 1 %."
 )
-FIGURES = ("trajectories", "phase", "spectra")
+FIGURES = ("trajectories", "phase")
 
 
 @dataclass(frozen=True)

@@ -36,13 +36,11 @@ from ep2sindy.studies.processes import NO_ZONES, TELLING, Zones, stated_roles
 from ep2sindy.studies.study import Count, Positive
 from ep2sindy.studies.views import CYCLE, add_samples
 
-WAVEFORM = "One period by phase, shown twice: samples, their waveform, and the model's."
 CAPTIONS = {
     "free_run": "The model (colour) integrated freely from the first sample of held-out "
     "time, over the data (grey): the first and the last periods.",
     "cycle": "Its cycle in the plane of two states, over the data (grey), and runs from other "
     "starts.",
-    "waveform": WAVEFORM,
 }
 SPREAD = "spread over windows"  # of the coefficients: no knowledge of a rate
 SPREAD_NOTE = (
@@ -185,15 +183,10 @@ def add_sustained(report: Report, name: str, found: SustainedModel) -> None:
 
 
 def add_cycle(report: Report, name: str, run: Evaluation) -> None:
-    """Add figures of the cycle of a model, if it has one. name: of the model, which names them."""
-    if run.cycle is None:
-        return
-    if len(run.model.states) > 1:
+    """Add the figure of the cycle of a model, if it has one. name: of the model."""
+    if run.cycle is not None and len(run.model.states) > 1:
         draw = partial(figures.cycle_figure, run.record, run.cycle)
         report.figure(f"cycle_{name}", draw, CAPTIONS["cycle"])
-    if figures.find_waveforms(run.record, run.rollout):
-        draw = partial(figures.waveform_figure, run.record, run.rollout)
-        report.figure(f"waveform_{name}", draw, CAPTIONS["waveform"])
 
 
 def _notes(found: SustainedModel) -> list[str]:

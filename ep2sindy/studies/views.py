@@ -27,19 +27,14 @@ from ep2sindy.studies.study import PositiveOrAll
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-MARKS = "Carets: the model leaves the panel; cross: a run that diverged stops."
 CAPTIONS = {
     "data": "States (start of the record) and their power spectra; the line marks the peak.",
-    "trajectories": "Models integrated from the first sample (colour) over the data (grey). "
-    f"{MARKS}",
+    "trajectories": "Models integrated from the first sample (colour) over the data (grey).",
     "trajectories_started": "The same from a start fitted to the first one and a half periods.",
     "trajectories_thesis": "The same with the thesis's terms, fitted to these data.",
-    "derivatives": "Right-hand sides on the data (colour) over the data's derivative (grey); "
-    "carets: a curve leaves the panel.",
+    "derivatives": "Right-hand sides on the data (colour) over the data's derivative (grey).",
     "phase": "Phase portraits of the integrated models (colour) over the data (grey), dots where "
-    f"they start. {MARKS}",
-    "spectra": "Power spectra of the integrated models (colour) and of the data over the same time "
-    "(grey); the dashed line marks the data's dominant frequency, the number is the model's.",
+    "they start.",
 }
 
 
@@ -100,7 +95,6 @@ def add_figures(
         "trajectories": partial(
             series.trajectory_figure, data, rollouts, duration_s=span, since=since, **how
         ),
-        "spectra": partial(series.spectrum_figure, data, rollouts, f_max_Hz=f_max_Hz, **how),
     }
     if smoother is not None:
         models = {name: run.model for name, run in runs.items()}
