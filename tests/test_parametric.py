@@ -1,4 +1,4 @@
-"""Given models fitted to every operating point, the quantities that they mean, and their trends."""
+"""Given models fitted to every operating point, the quantities that they mean, and their laws."""
 
 import re
 from collections.abc import Sequence
@@ -16,7 +16,6 @@ from ep2sindy.operating.quantities import (
     Quantity,
     control_functions,
     estimate_quantities,
-    fit_trend,
     lines_of,
 )
 from ep2sindy.regression.constrained import solve_constrained
@@ -289,43 +288,6 @@ def test_ends_of_intervals_are_carried_from_coefficients_to_quantities() -> None
     (bare,) = estimate_quantities(model_of(), {"L": LENGTH}).values()
     assert bare.value == 0.025
     assert np.isnan([bare.low, bare.high]).all()
-
-
-def test_a_trend_is_the_exponent_of_a_power_law_with_the_interval_of_its_values() -> None:
-    x, rng = np.array([2.0, 4.0, 5.0, 6.0]), np.random.default_rng(0)
-    values, std = -3.0 * x**-0.3, np.array([0.02, 0.03, 0.01, 0.02])
-    trend = fit_trend(x, values, std)
-    assert (trend.n_points, trend.exponent) == (4, pytest.approx(-0.3))
-    assert trend.r2 == pytest.approx(1.0)
-    draws = values + std * rng.normal(size=(20000, 4))
-    slopes = np.polyfit(np.log(x), np.log(-draws).T, 1)[0]
-    # 20000 draws know a standard deviation to 0.5 %; errors of 2 % are nearly linear.
-    reach = 1.959964 * slopes.std()
-    assert (trend.low, trend.high) == pytest.approx((-0.3 - reach, -0.3 + reach), rel=0.01)
-    unknown = fit_trend(x, values)
-    assert unknown.exponent == trend.exponent
-    assert np.isnan([unknown.low, unknown.high]).all()
-
-
-def test_two_points_say_nothing_of_how_good_a_power_law_is() -> None:
-    trend = fit_trend(np.array([200.0, 400.0]), np.array([2.0, 8.0]), np.array([0.1, 0.1]))
-    assert (trend.n_points, trend.exponent) == (2, pytest.approx(2.0))
-    assert np.isnan([trend.low, trend.high, trend.r2]).all()
-
-
-@pytest.mark.parametrize("x", [[3.0, 3.0], [-1.0, 2.0, 3.0]])
-def test_there_is_no_exponent_without_two_positive_values(x: list[float]) -> None:
-    trend = fit_trend(np.array(x), np.ones(len(x)), np.ones(len(x)))
-    assert np.isnan([trend.exponent, trend.low, trend.high, trend.r2]).all()
-
-
-def test_r2_says_whether_points_lie_on_a_power_law() -> None:
-    # Logarithms 0, 1, 0 over 0, 1, 2: the line is flat at 1/3, and explains nothing.
-    x, bent = np.exp([0.0, 1.0, 2.0]), np.exp([0.0, 1.0, 0.0])
-    assert fit_trend(x, bent).r2 == pytest.approx(0.0, abs=1e-12)
-    # Logarithms 0, 1, 1: the line 1/6 + x/2 leaves 1/6 of 2/3.
-    assert fit_trend(x, -np.exp([0.0, 1.0, 1.0])).r2 == pytest.approx(0.75)
-    assert np.isnan(fit_trend(x, np.ones(3)).r2)
 
 
 def test_trends_go_along_the_longest_line_of_each_parameter() -> None:

@@ -1,4 +1,4 @@
-"""Physical quantities read from coefficients at each point, and their laws and trends."""
+"""Physical quantities read from coefficients at each point, and their laws."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from itertools import combinations
 
 import numpy as np
 from jaxtyping import Float
-from scipy.special import ndtri
 
 from ep2sindy.data.numbers import least_squares
 from ep2sindy.library.library import Library, named_terms, polynomial
@@ -242,49 +241,6 @@ def _rms(errors: np.ndarray) -> float:
 def _relative(errors: np.ndarray, values: np.ndarray) -> float:
     mean = abs(float(values.mean()))
     return _rms(errors) / mean if mean else float("nan")
-
-
-@dataclass(frozen=True)
-class Trend:
-    """Exponent p of |quantity| ~ parameter^p along one parameter, the others held.
-
-    r2: of the line through the logarithms; it tells whether the points follow a power law at all,
-    and is also near zero without a trend. low and high: 95 % interval of the exponent by the
-    intervals of the values, points independent: how well the slope is known, not whether the points
-    lie on a line. Of two points, which are always on a line, these are NaN.
-    """
-
-    exponent: float
-    r2: float
-    low: float
-    high: float
-    n_points: int
-
-
-def fit_trend(
-    x: Float[np.ndarray, " points"],
-    values: Float[np.ndarray, " points"],
-    std: Float[np.ndarray, " points"] | None = None,
-) -> Trend:
-    """Slope of log |values| against log x by least squares.
-
-    std: standard deviations of the values; None if they are unknown. The exponent is NaN unless x
-    is positive and has two different values; r2 also for under three points or equal values.
-    """
-    n, nothing = len(x), float("nan")
-    if n < 2 or np.ptp(x) == 0.0 or x.min() <= 0.0:
-        return Trend(nothing, nothing, nothing, nothing, n)
-    logs, centred = np.log(np.abs(values)), np.log(x) - np.log(x).mean()
-    weights = centred / np.square(centred).sum()
-    slope = float(weights @ logs)
-    if n < 3:
-        return Trend(slope, nothing, nothing, nothing, n)
-    reach = nothing
-    if std is not None:
-        reach = float(ndtri(0.5 + 0.5 * LEVEL) * np.linalg.norm(weights * std / values))
-    line = logs.mean() + slope * centred
-    fraction = float(r2(truth=logs, prediction=line[None])[0]) if np.ptp(logs) > 0.0 else nothing
-    return Trend(slope, fraction, slope - reach, slope + reach, n)
 
 
 def lines_of(

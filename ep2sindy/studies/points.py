@@ -64,7 +64,7 @@ Records = Mapping[int, tuple[OperatingRecord, str]]  # by number of the point, w
 class ModelSettings:
     """The terms of every state, with relations and known coefficients that hold at every point.
 
-    quantities: what coefficients stand for; their control laws and trends are found.
+    quantities: what coefficients stand for; their control laws are found.
     """
 
     terms: Terms

@@ -1,4 +1,4 @@
-"""Quantities read from coefficients over operating points: their tables, control laws, trends."""
+"""Quantities read from coefficients over operating points: their tables and control laws."""
 
 from __future__ import annotations
 
@@ -7,21 +7,17 @@ from functools import partial
 
 import numpy as np
 import pandas as pd
-from scipy.special import ndtri
 
 from ep2sindy.figures.operating import rows_at, trends_figure
 from ep2sindy.library.library import Library
 from ep2sindy.operating.given_models import REFINED, GivenModel, PointResult
 from ep2sindy.operating.quantities import (
-    LEVEL,
     ControlLaw,
     control_functions,
     fit_control_law,
-    fit_trend,
     lines_of,
 )
-from ep2sindy.report.document import Equation, Result, Table
-from ep2sindy.report.models import with_error
+from ep2sindy.report.document import Equation, Result
 from ep2sindy.report.report import Report
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View, percent
 
@@ -36,10 +32,6 @@ INTERVALS = (
     "without noise, which may be many times as large; refinements differentiate nothing. Refined "
     "models follow trajectories: R2 is that of the derivative, and may be negative where pulses "
     "are sharp."
-)
-TRENDS = (
-    "Exponents p of quantity ~ parameter^p, with the other parameters held, and their 95 % "
-    "intervals. R2 says whether the points follow it."
 )
 CONTROL = (
     "Errors are RMS over the mean, at points left out: of the law's terms, fitted without the "
@@ -74,7 +66,7 @@ def add_quantities(
     published: pd.DataFrame,
     labels: Mapping[str, str],
 ) -> Result:
-    """Add control laws, trends and figures of quantities, and their values at every point.
+    """Add control laws and figures of quantities, and their values at every point.
 
     errors: for each fit, the mean error of its law at points left out; empty if the points do not
     suffice for laws. published: see `read_published`. labels: of parameters and quantities on axes.
@@ -99,10 +91,9 @@ def add_quantities(
     bold = [k for k, (fit, _) in enumerate(laws) if fit == best]
     report.table("control_laws", ResultTable(rows, CONTROL_LAW), note=CONTROL, bold=bold)
     lines = lines_of([result.parameters for result in results if result.fits] or [{}])
-    report.section("Trends")
+    report.section("Quantities", INTERVALS)
     _add_figures(report, estimates, laws, published, lines, errors, labels)
-    report.table("trends", trends(estimates, published, lines), note=TRENDS)
-    _add_values(report, estimates, units)
+    report.table("quantities", estimates, shown=False)
     shown = [
         _equation(name, law, units[fit, name], percent(2)(law.search_error))
         for (fit, name), law in laws.items()
@@ -174,25 +165,6 @@ def control_laws(
     return found
 
 
-def trends(
-    estimates: pd.DataFrame,
-    published: pd.DataFrame,
-    lines: Sequence[tuple[str, Mapping[str, float]]],
-) -> pd.DataFrame:
-    """Exponents along each parameter with the others held, for our and the published values."""
-    rows = []
-    for along, at in lines:
-        for (fit, name), own in rows_at(estimates, at).groupby(["fit", "quantity"], sort=False):
-            where = {"fit": fit, "quantity": name}
-            used, known = own[own["usable"]], rows_at(published, {**at, **where})
-            std = (used["high"] - used["low"]) / (2.0 * ndtri(0.5 + 0.5 * LEVEL))
-            x, values = used[along].to_numpy(), used["value"].to_numpy()
-            trend = {"along": along, **vars(fit_trend(x, values, std.to_numpy()))}
-            thesis = fit_trend(known[along].to_numpy(), known["value"].to_numpy()).exponent
-            rows.append(where | trend | {"thesis": thesis})
-    return pd.DataFrame(rows)
-
-
 def _add_figures(
     report: Report,
     estimates: pd.DataFrame,
@@ -221,35 +193,7 @@ def _add_figures(
         )
 
 
-def _add_values(
-    report: Report, estimates: pd.DataFrame, units: Mapping[tuple[str, str], str]
-) -> None:
-    """Add the quantities of every fit, one row per point, with the scores of the fit.
-
-    They are shown as `0.0241 ±0.0001 (0.025)`: value, half the interval's width, published value.
-    """
-    report.section("Quantities", INTERVALS)
-    report.table("quantities", estimates, shown=False)
-    for fit, own in estimates.groupby("fit", sort=False):
-        scores = rows_at(report.tables["fits"], {"fit": fit}).drop(columns="fit")
-        point = list(scores.columns[: scores.columns.get_loc("status")])
-        reach = 0.5 * (own["high"] - own["low"])
-        cells = [
-            with_error(value, error) + ("" if np.isnan(thesis) else f" ({thesis:.3g})")
-            for value, error, thesis in zip(own["value"], reach, own["thesis"], strict=True)
-        ]
-        headings = [_heading(name, units[str(fit), name]) for name in own["quantity"]]
-        wide = own.assign(cell=cells, heading=headings).set_index([*point, "heading"])["cell"]
-        table = wide.unstack(sort=False).join(scores.set_index(point)).reset_index()
-        report.add(Table(table, title=str(fit)))
-
-
 def _equation(name: str, law: ControlLaw, unit: str = "", error: str = "") -> Equation:
     mark = f" ({error} off where left out)" if error else ""
     shown = "" if unit == "1" else unit
     return Equation(name, law.coef_by_term, rate=False, unit=shown, mark=mark, on_screen=True)
-
-
-def _heading(name: str, unit: str) -> str:
-    """`g_inj (m^-3 s^-1)`: a quantity with its unit; names such as `L_m` already end in theirs."""
-    return name if unit == "1" or name.endswith(f"_{unit}") else f"{name} ({unit})"
