@@ -1,4 +1,4 @@
-"""Forecasts in studies: their section with its sentence, table and figure."""
+"""Forecasts in studies: their section with its sentence and figure."""
 
 from __future__ import annotations
 
@@ -11,12 +11,10 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.figures.series import forecast_figure
 from ep2sindy.forecasting.skill import ForecastSkill, forecast_skill
 from ep2sindy.model.model import SparseModel
-from ep2sindy.report.document import Table
 from ep2sindy.report.report import Report
 from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.studies.source import LEAST_SAMPLES, is_short
 
-SHOWN_PERIODS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0)
 CAPTION = (
     "Forecast from the first held-out sample on, fitted to the past alone, with the band "
     "that is to hold 90 % of the samples. Last panel: error of forecasts from starts all over the "
@@ -52,23 +50,15 @@ def add_forecasts(
 
     name: of the model, which names the files.
     """
-    report.section(title, f"forecasts: {skill.text}", _table(skill), level=3)
+    report.section(title, f"forecasts: {skill.text}", _note(skill), level=3)
     report.figure(f"forecast_{name}", partial(forecast_figure, run, skill), CAPTION)
     errors = pd.DataFrame({"horizon_s": skill.horizons_s, **skill.nrmse})
     report.samples(f"forecast_{name}", errors)
     report.summary.setdefault("forecasts", {})[name] = skill.summary()
 
 
-def _table(skill: ForecastSkill) -> Table:
-    """Errors at a few horizons, by who forecasts."""
-    in_periods = skill.unit == "periods"
-    last = float(skill.horizons_s[-1]) / skill.unit_s
-    asked = SHOWN_PERIODS if in_periods else (1.0, 2.0, 4.0, 8.0, 16.0)
-    shown = [each for each in asked if each <= 1.02 * last] or [last]
-    rows = pd.DataFrame([skill.at(each * skill.unit_s) for each in shown])
-    units = [skill.unit if each > 1 else skill.unit[:-1] for each in shown]
-    ahead = [f"{each:g} {unit} ahead" for each, unit in zip(shown, units, strict=True)]
-    rows.insert(0, "horizon", ahead)
+def _note(skill: ForecastSkill) -> str:
+    """How many forecasts there are, and how far their bands can be trusted."""
     held = f"the bands of 90 % hold {100.0 * skill.coverage_90:.0f} % of the samples"
     if not np.isfinite(skill.coverage_90):
         held = (
@@ -76,8 +66,4 @@ def _table(skill: ForecastSkill) -> Table:
             "throughout, or forecasts of it diverge"
         )
     steps = " Baselines take the samples interpolated onto equal steps." if skill.resampled else ""
-    return Table(
-        rows,
-        title="error of forecasts (standard deviations)",
-        note=f"{skill.n_starts} starts, each fitted to the past alone; {held}.{steps}",
-    )
+    return f"{skill.n_starts} starts, each fitted to the past alone; {held}.{steps}"

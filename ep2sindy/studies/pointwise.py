@@ -3,28 +3,24 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import product
 from typing import Annotated
 
 import numpy as np
-import pandas as pd
 import xarray as xr
 
 from ep2sindy.data.fields import write_netcdf
 from ep2sindy.discovery.method import AnyMethod, Regression
 from ep2sindy.discovery.pointwise import STATUSES, PointSearch, pointwise
-from ep2sindy.discovery.regimes import UNSURE, Regimes, find_regimes, spread
+from ep2sindy.discovery.regimes import UNSURE, Regimes, find_regimes
 from ep2sindy.figures.maps import coefficient_maps, quality_maps, regime_map, space_axes
 from ep2sindy.library.library import Library, named_terms
 from ep2sindy.library.terms import variables_of
 from ep2sindy.report.document import Equation, Result, Table, Text
 from ep2sindy.report.report import Report
 from ep2sindy.runtime.parallel import Workers
-from ep2sindy.runtime.progress import Advance
 from ep2sindy.studies.resume import resumed
 from ep2sindy.studies.source import Step, open_prepared, report_field, report_simulation
 from ep2sindy.studies.study import A_LIST, Count, Deferred, Names
@@ -52,18 +48,10 @@ MEDIANS = (
     "has all of them, and coefficients spread as the tables say, which hold the other terms as "
     "well (those that act are bold)."
 )
-OVER_ALL = (
-    "selected: fraction of the fitted points; inclusion: fraction of the bootstraps. Median, 16 "
-    "and 84 % "
-    "over the points that have the term, in the unit named. All values by point, term and equation "
-    "lie in pointwise.nc."
-)
-# Columns that are shown of the tables of terms and of regimes, with their headings.
+# Columns that are shown of the table of regimes, with their headings.
 HEADINGS = {
-    "equation": "equation", "term": "term",
-    "selected": "selected", "inclusion": "inclusion", "in_support": "points that have it",
-    "coef": "median", "low": "16 %", "coef_low": "16 %", "high": "84 %", "coef_high": "84 %",
-    "unit": "unit", "coef_units": "unit",
+    "equation": "equation", "term": "term", "in_support": "points that have it",
+    "coef": "median", "coef_low": "16 %", "coef_high": "84 %", "coef_units": "unit",
 }  # fmt: skip
 
 
@@ -128,7 +116,7 @@ class Study:
                 search,
                 workers=workers,
                 block_points=self.block_points,
-                progress=CountedPoints(report),
+                progress=report.watch,
             )
         wall_s = time.perf_counter() - begin
         rng = np.random.default_rng(report.seed)
@@ -140,26 +128,6 @@ class Study:
         add_result(report, result, found, wall_s=wall_s, outline=self.outline)
 
 
-@dataclass(frozen=True, eq=False)
-class CountedPoints:
-    """Progress of the run, and the number of points done in TensorBoard."""
-
-    report: Report
-
-    @contextmanager
-    def stage(self, total: int | None, unit: str, label: str = "") -> Iterator[Advance]:
-        done = 0
-        with self.report.progress(total, unit, label) as advance:
-
-            def count(n_more: int) -> None:
-                nonlocal done
-                done += n_more
-                advance(n_more)
-                self.report.board.scalars({"points/done": float(done)}, step=done)
-
-            yield count
-
-
 def add_result(
     report: Report,
     result: xr.Dataset,
@@ -168,7 +136,7 @@ def add_result(
     wall_s: float,
     outline: Thruster | None = None,
 ) -> None:
-    """Say what was found at the points, and add regimes, maps and terms.
+    """Say what was found at the points, and add regimes and maps.
 
     wall_s: duration of the search.
     """
@@ -192,9 +160,6 @@ def add_result(
         caption = LINE_CAPTION if result["status"].ndim == 1 else CAPTIONS["coefficients"]
         report.figure("coefficients", partial(coefficient_maps, result, outline=outline), caption)
     report.figure("quality", partial(quality_maps, result, outline=outline), CAPTIONS["quality"])
-    report.section("Terms over all fitted points")
-    terms = terms_table(result)
-    report.table("terms", terms, shown=Table(_readable(terms), note=OVER_ALL))
 
 
 def count_points(report: Report, result: xr.Dataset, wall_s: float) -> str:
@@ -242,33 +207,7 @@ def _add_regime(report: Report, regimes: Regimes, regime: int) -> None:
         level=3,
     )
     held = rows[rows["in_support"] > 0.0]
-    held = held.assign(equation=held["equation"] + "'")
-    report.add(Table(_readable(held), bold=np.flatnonzero(held["acts"]).tolist()))
-
-
-def terms_table(result: xr.Dataset) -> pd.DataFrame:
-    """How often each term is selected and how large it is, over all fitted points.
-
-    selected: fraction of the points. inclusion: fraction of the bootstraps that have the term,
-    averaged over the points. coef, low, high: median, 16 % and 84 % over the points that have the
-    term.
-    """
-    fitted = (result["status"] == 0).values
-    rows = []
-    for equation, term in product(result["equation"].values, result["term"].values):
-        here = result.sel(equation=equation, term=term)
-        coef, inclusion = (here[name].values[fitted] for name in ("coef", "inclusion"))
-        low, middle, high = spread(coef)
-        fractions = np.count_nonzero(coef) / max(coef.size, 1), float(inclusion.mean())
-        unit = str(here["coef_units"].values)
-        rows.append((f"{equation}'", str(term), *fractions, middle, low, high, unit))
-    names = ["equation", "term", "selected", "inclusion", "coef", "low", "high", "unit"]
-    return pd.DataFrame(rows, columns=names)
-
-
-def _readable(rows: pd.DataFrame) -> pd.DataFrame:
-    """The columns that are shown, under their headings, with fractions in percent."""
-    fractions = [name for name in ("selected", "inclusion", "in_support") if name in rows]
-    percent = {name: [f"{100.0 * fraction:.0f} %" for fraction in rows[name]] for name in fractions}
-    shown = [name for name in HEADINGS if name in rows]
-    return rows.assign(**percent)[shown].rename(columns=HEADINGS)
+    fractions = [f"{fraction:.0%}" for fraction in held["in_support"]]
+    shown = held.assign(equation=held["equation"] + "'", in_support=fractions)
+    shown = shown[[*HEADINGS]].rename(columns=HEADINGS)
+    report.add(Table(shown, bold=np.flatnonzero(held["acts"]).tolist()))
