@@ -260,7 +260,7 @@ class Study:
             rows = Regression(self.formulation, bootstraps=self.bootstraps)
             parts = split_in_time(runs[0], self.held_out or HELD_OUT)
             sustained = sustained_model(
-                *parts, library, rows, self.sustained, found.model, zones, rng=rng,
+                *parts, library, rows, self.sustained, zones, rng=rng,
                 progress=progress,
             )  # fmt: skip
             beside = model_balance(

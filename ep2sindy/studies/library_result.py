@@ -26,10 +26,9 @@ from ep2sindy.studies.sustained import SUSTAINED_MODEL, SustainedModel
 from ep2sindy.studies.views import EVALUATED, EVALUATION, best_run, found_model, worst_run
 
 FROM_DERIVATIVES = (
-    "Self-sustained models, which free runs select, and equations selected by derivatives and "
-    "then refined "
-    "are run over held-out time; the equations that fits of derivatives select, and the thesis's "
-    "terms fitted here, over the record from its first sample."
+    "Self-sustained models, which free runs select, are run over held-out time; the equations "
+    "that fits of derivatives select, and the thesis's terms fitted here, over the record from its "
+    "first sample."
 )
 
 
@@ -93,10 +92,7 @@ def add_evaluations(
     runs: dict[str, Evaluation] = {}
     for name, result in results.items():
         if result.sustained is not None:
-            runs |= {
-                f"{name}_sustained": result.sustained.run,
-                f"{name}_refined": result.sustained.refined,
-            }
+            runs[f"{name}_sustained"] = result.sustained.run
         runs |= {name: result.runs[0]}
         others = zip(files[1:], result.runs[1:], strict=True)
         runs |= {f"{name}, {file}": run for file, run in others}

@@ -141,14 +141,11 @@ class SustainedModel:
     """A closed model that was searched for by free runs, and its run over the held-out part.
 
     run: starts at the first held-out sample, smoothed by a Kalman smoother so that the sample's
-    noise is not attributed to the model. refined: the run of the equations that derivatives select,
-    refined with the same terms. refinement: status of that.
+    noise is not attributed to the model.
     """
 
     discovery: Discovery
     run: Evaluation
-    refined: Evaluation
-    refinement: str
 
     @property
     def model(self) -> SparseModel:
@@ -161,12 +158,11 @@ SUSTAINED_MODEL: Metrics[SustainedModel] = [
     Metric("proved", lambda found: "; ".join(consequences(found.model))),
     Metric("selection", lambda found: found.discovery.note),
     Metric("lack_of_fit", lambda found: found.discovery.lack_of_fit),
-    Metric("refinement_by_derivatives", lambda found: found.refinement),
 ]
 
 
 def add_sustained(report: Report, name: str, found: SustainedModel) -> None:
-    """Add the model, how it runs, and how the choice of derivatives does; name: of the library."""
+    """Add the model and how it runs; name: of the library."""
     model, clock, run = found.model, found.run.rollout.clock, found.run
     held_to = found.discovery.constraint
     report.section(f"{name}: the model that free runs select ({run.text})")
@@ -176,8 +172,7 @@ def add_sustained(report: Report, name: str, found: SustainedModel) -> None:
         period_s = run.cycle.period_s
         draw = partial(figures.free_run_figure, run.record, run.rollout, period_s=period_s)
         report.figure(f"free_run_{name}", draw, CAPTIONS["free_run"])
-    report.model(f"{name}_refined", found.refined.model, shown=False)
-    report.add(*_notes(found))
+    report.add(_notes(found))
     add_cycle(report, name, run)
     add_samples(report, run.record, {f"{name}_sustained": run})
 
@@ -189,18 +184,14 @@ def add_cycle(report: Report, name: str, run: Evaluation) -> None:
         report.figure(f"cycle_{name}", draw, CAPTIONS["cycle"])
 
 
-def _notes(found: SustainedModel) -> list[str]:
-    """On the selection, the stability, and the equations selected by derivatives."""
+def _notes(found: SustainedModel) -> str:
+    """On the selection, the stability, and the lack of fit."""
     proved = consequences(found.model)
     notes = [f"By its terms {'; '.join(proved)}."] if proved else []
     notes.append(f"Selection: {found.discovery.note}.")
     notes += [found.run.cycle_text] if found.run.cycle_text else []
     notes += [f"Lack of fit: {found.discovery.lack_of_fit}."] if found.discovery.lack_of_fit else []
-    text = "; ".join(found.refined.model.text().splitlines())
-    refined = f"refined as they are ({found.refinement})"
-    if found.refinement == "non_finite":
-        refined = "cannot be refined: no trajectory of theirs stays finite over two periods"
-    return [" ".join(notes), f"The equations selected by their derivatives, {refined}: {text}."]
+    return " ".join(notes)
 
 
 def sustained_model(
@@ -209,26 +200,17 @@ def sustained_model(
     library: Library,
     rows: Regression,
     settings: SustainedSearch,
-    selected: SparseModel,
     zones: Zones,
     *,
     rng: np.random.Generator,
     progress: Progress = SILENT,
 ) -> SustainedModel:
-    """Find a self-sustained model in one part of a record, and run it over the other.
-
-    selected: the model selected by derivatives, which is refined for comparison, on windows of two
-    periods if the record has a period.
-    """
-    from ep2sindy.refinement.refine import refine  # loads torch, only for a refinement
-
+    """Find a self-sustained model in one part of a record, and run it over the other."""
     found = settings.found(train, library, rows, zones, rng=rng, progress=progress)
     with progress.stage(None, "", "free run"):
         start = start_of(held, found.model)
         run = evaluate(found.model, held, initial=start, bounds=settings.bounds)
-    refined = refine(selected, [train], window=two_periods(train), seed=0, progress=progress)
-    own = evaluate(refined.model, held, initial=start_of(held, selected))
-    return SustainedModel(found, run, own, refined.status)
+    return SustainedModel(found, run)
 
 
 def start_of(run: Trajectory, model: SparseModel) -> np.ndarray:
