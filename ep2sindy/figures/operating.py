@@ -1,4 +1,4 @@
-"""Figures of laws of the operating point: coefficients, points left out, maps and trends.
+"""Figures of laws of the operating point: coefficients, maps and quantities.
 
 The maps show frequency and amplitude of a law's limit cycle over its parameters; the trends, the
 quantities of the parametric study over one parameter. Filled marks belong to the line, and every
@@ -24,13 +24,12 @@ from matplotlib.textpath import TextPath
 
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.figures import style
-from ep2sindy.figures.style import COLOURS, DATA, GREY, MORE_COLOURS, SMALL, TITLE, WIDTH
-from ep2sindy.library.equations import latex_derivative, latex_name, latex_term_name
+from ep2sindy.figures.style import COLOURS, DATA, GREY, MORE_COLOURS, TITLE, WIDTH
+from ep2sindy.library.equations import latex_derivative, latex_term_name
 from ep2sindy.library.units import unit_product, with_prefix
 from ep2sindy.operating.law import OperatingLaw
 from ep2sindy.operating.quantities import ControlLaw
 
-FAR_PERCENT, FAR_WAVEFORM = 40.0, 0.6  # beyond: filled marks on the edge
 MIN_RANGE = 0.1  # least axis range, as a fraction of the coefficient's size
 MAX_LINES = 5  # number of the other parameters' values that are drawn
 FADED = 0.35  # opacity of a map's colours beyond the points that the law was fitted to
@@ -133,62 +132,6 @@ def _focus(ax: Axes, values: np.ndarray) -> None:
     low, high = values.min(), values.max()
     reach = max(0.65 * (high - low), 0.5 * MIN_RANGE * np.abs(values).max()) or 0.5
     ax.set_ylim(0.5 * (low + high) - reach, 0.5 * (low + high) + reach)
-
-
-def left_out_figure(rows: pd.DataFrame) -> Figure:
-    """Frequency and amplitudes of free runs at points left out, against those of the records.
-
-    rows: the points of one law.
-    """
-    figure, ((left, right),) = style.make_panels(1, 2, (WIDTH, 4.4))
-    _draw_frequencies(left, rows)
-    _draw_shapes(right, rows)
-    for ax in (left, right):
-        ax.set_box_aspect(1.0)
-        ax.grid(alpha=0.3)
-        ax.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False,
-                  fontsize=SMALL)  # fmt: skip
-    return figure
-
-
-def _draw_frequencies(ax: Axes, rows: pd.DataFrame) -> None:
-    """Draw frequencies of the free runs against those of the records."""
-    factor, unit = frequency_scale(rows["f_kHz"])
-    f, ratio = factor * rows["f_kHz"], 1.0 + rows["f_error"]
-    known = np.stack([f, f * ratio], axis=1)
-    for enclosed, words in ((True, "enclosed by the others"), (False, "outside them")):
-        face = COLOURS[0] if enclosed else "white"
-        mark: dict[str, Any] = {"color": COLOURS[0], "mfc": face, "ms": 6, "label": words}
-        ax.plot(*known[rows["enclosed"] == enclosed].T, "o", zorder=3, **mark)
-    ends = np.array([0.96, 1.04]) * [np.nanmin(known), np.nanmax(known)]
-    band: dict[str, Any] = {"color": GREY, "alpha": 0.3, "lw": 0.0, "zorder": 0, "label": "1 %"}
-    ax.plot(ends, ends, color=GREY, lw=1.0, zorder=1)
-    ax.fill_between(ends, 0.99 * ends, 1.01 * ends, **band)
-    ax.set(xlabel=f"frequency of the record ({unit})", ylabel=f"of the free run ({unit})")
-    ax.set(xlim=ends, ylim=ends)
-
-
-def _draw_shapes(ax: Axes, rows: pd.DataFrame) -> None:
-    """Draw waveform errors against amplitude errors."""
-    names = [str(name) for name in rows]
-    of = "amplitude_ratio_"
-    far_percent, far_waveform = 12.0, 0.24  # a little beyond the bounds, and up to the farthest
-    states = [name.removeprefix(of) for name in names if name.startswith(of)]
-    for state, marker, colour in zip(states, cycle(MARKERS), cycle(MORE_COLOURS), strict=False):
-        off, error = 100.0 * (rows[f"{of}{state}"] - 1.0), rows[f"waveform_error_{state}"]
-        far_percent = max(far_percent, min(1.2 * off.abs().max(), FAR_PERCENT))
-        far_waveform = max(far_waveform, min(1.2 * error.max(), FAR_WAVEFORM))
-        near = (off.abs() <= FAR_PERCENT) & (error <= FAR_WAVEFORM)
-        mark: dict[str, Any] = {"ls": "none", "marker": marker, "color": colour, "ms": 6}
-        ax.plot(off[near], error[near], mfc="none", label=f"${latex_name(state)}$", **mark)
-        if near.all():
-            continue  # an empty artist that is not clipped would fill the canvas in the layout
-        edge = off[~near].clip(-FAR_PERCENT, FAR_PERCENT), error[~near].clip(0, FAR_WAVEFORM)
-        ax.plot(*edge, clip_on=False, zorder=5, **mark)
-    ax.axvspan(-10, 10, color=GREY, alpha=0.3, lw=0, label="10 % of amplitude")
-    ax.axhline(0.2, color=GREY, lw=1.0, label="0.2 of waveform")
-    ax.set(xlabel="error of the amplitude (%)", ylabel="error of the waveform (std)")
-    ax.set(xlim=(-far_percent, far_percent), ylim=(0.0, far_waveform))
 
 
 def frequency_scale(f_kHz: pd.Series) -> tuple[float, str]:

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
-from ep2sindy.figures.operating import cycle_figure, laws_figure, left_out_figure
+from ep2sindy.figures.operating import cycle_figure, laws_figure
 from ep2sindy.model.comparison import Status
 from ep2sindy.operating.law import LawFunctions, OperatingLaw, read_law
 from ep2sindy.operating.left_out import (
@@ -58,10 +58,6 @@ CAPTIONS = {
     "five values of the other parameters. Where the open points leave the lines by more than their "
     "bars, other coefficients make up for it: points are sloppy in some directions, and those "
     "count little.",
-    "left_out": "Points left out, each read off the law of the others. Left: frequency of the free "
-    "run over the record's, the band 1 %. Right: errors of amplitude and waveform of each "
-    "state, those beyond the panel filled on its edge; band and line are the bounds of a "
-    "self-sustained model.",
     "map": "Frequency and relative amplitude (standard deviation over mean) of the law's cycle "
     "over the operating parameters, none where it rests, and of the records (circles); "
     "crosses: points that do not oscillate; diamonds: records of another cycle, not fitted here. "
@@ -235,7 +231,7 @@ def add_law(
         head,
         [*equations(model, lead=f"at {middle.label}"), *shown],
         load='ep.operating.OperatingLaw.load("{}/law.json")',
-        picture=next(name for name in ("map", "left_out", "laws") if name in report.figures),
+        picture=next(name for name in ("map", "laws") if name in report.figures),
     )
 
 
@@ -289,9 +285,6 @@ def _add_left_out(report: Report, found: FoundLaw) -> None:
     ]
     report.section("Prediction of points left out")
     report.table("left_out", ResultTable(found.runs, metrics), note=LEFT_OUT)
-    left_out = report.tables["left_out"]
-    if left_out["f_error"].notna().any():
-        report.figure("left_out", partial(left_out_figure, left_out), CAPTIONS["left_out"])
     if not found.statistics["n_sustained"]:
         report.warn(
             f"none of {len(found.runs)} points left out is sustained by the law of the others, "
