@@ -57,6 +57,14 @@ def test_the_thesis_stands_next_to_our_cells(toy_run: Path) -> None:
     assert len(pd.read_csv(toy_run / "tables" / "outcomes.csv")) == 8
 
 
+def test_the_page_shows_both(toy_run: Path) -> None:
+    page = (toy_run / "report.html").read_text()
+    for name in ("benchmark", "attractors", "trajectories"):
+        assert f'id="figure-{name}"' in page
+    assert "Identified by ours" in page  # the last variant that makes models
+    assert "thesis_on_front</th>" in page
+
+
 def test_the_published_tables_are_those_of_the_thesis() -> None:
     table = published_cells().set_index(["variant", "system", "noise"])
     assert len(table) == 4 * 4 * 3

@@ -14,6 +14,4 @@ def test_frontier_runs_at_toy_size(tmp_path: Path) -> None:
     assert found["ours", 20.0, 40.0]
     assert not found["STLSQ", 1.0, 5.0]
     assert "STLSQ 1" in frontier.page  # too few samples to smooth
-    lowest = frontier.report.tables["lowest_rates"].set_index("variant")
-    assert lowest.loc["STLSQ", "40 s"] == 20.0
     frontier.check_figures("frontier")

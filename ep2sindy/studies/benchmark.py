@@ -27,16 +27,15 @@ from ep2sindy.figures.identified import (
     Identified,
     attractor_figure,
     benchmark_figure,
-    merit_table,
 )
 from ep2sindy.library.library import Library
-from ep2sindy.report.document import Result, Table, Text, places
+from ep2sindy.report.document import Result, Text
 from ep2sindy.report.report import Report
 from ep2sindy.runtime.parallel import Workers, rows_in_order
 from ep2sindy.runtime.progress import SILENT, Progress, count_pieces
 from ep2sindy.studies.resume import resumed
 from ep2sindy.studies.study import Count, Deferred, Levels, Names
-from ep2sindy.systems.draws import DRAWS, check_systems, realization
+from ep2sindy.systems.draws import check_systems, realization
 from ep2sindy.systems.systems import System
 
 FIGURE = (
@@ -52,17 +51,16 @@ INTRODUCTION = (
     "Each realization draws an initial state, or for the Van der Pol oscillator its parameter, at "
     "random; white noise of the given fraction of each state's RMS is added; the library holds all "
     "products of the states up to a degree. A realization counts only if the equations of all "
-    "states are right at once. Every variant sees the same realizations. Italic rows: the "
-    "thesis's own numbers, for 100 realizations. CPU: time of one search (all equations of one "
-    "realization), on one thread."
+    "states are right at once. Every variant sees the same realizations."
+)
+CELLS = (
+    "on_front, selected: numbers of realizations, of n, whose true equations are on the front, and "
+    "are the ones selected; mean_correct_terms: true terms among the selected, in the mean; "
+    "cpu_s_per_search: of all equations of one realization, on one thread. thesis: its own "
+    "numbers, of 100 realizations."
 )
 SELECTED = {"selected": "selected exactly right", "on_front": "right on the front"}
 Draw = Callable[[str, float, int], tuple[System, list[Trajectory]]]  # `realization`, with settings
-TITLES = {
-    "on_front": "True equations on the front, % of realizations",
-    "selected": "True equations selected, % of realizations",
-    "mean_correct_terms": "True terms among the selected, mean (all of them in brackets)",
-}
 
 
 @runtime_checkable
@@ -260,15 +258,13 @@ def published_cells() -> pd.DataFrame:
 def add_tables(
     report: Report, outcomes: pd.DataFrame, cells: pd.DataFrame, published: pd.DataFrame
 ) -> None:
-    """Add all outcomes, and our cells next to the thesis's: as a whole, and by figure of merit."""
+    """Add all outcomes, and our cells next to the thesis's."""
     keys, columns = ["system", "noise", "variant"], {merit: f"thesis_{merit}" for merit in MERITS}
     beside = published.rename(columns=columns)[[*keys, *columns.values()]]
     beside = cells.astype(dict.fromkeys(COUNTS, "Int64")).merge(beside, how="left", on=keys)
     report.samples("outcomes", outcomes)
-    report.table("cells", beside, shown=False)
-    levels = "/".join(f"{100 * noise:g}" for noise in cells["noise"].unique())
-    report.section(f"By system; noise {levels} %")
-    report.add(*(_readable(cells, published, merit) for merit in MERITS))
+    report.section("By system and noise")
+    report.table("cells", beside, note=CELLS, page_only=True)
 
 
 def means(cells: pd.DataFrame) -> dict[str, float]:
@@ -296,30 +292,3 @@ def best_variant(cells: pd.DataFrame) -> Result:
         load='pandas.read_csv("{}/tables/cells.csv")',
         picture="benchmark",
     )
-
-
-def _readable(cells: pd.DataFrame, published: pd.DataFrame, merit: str) -> Table:
-    """One row per variant or published one, one column per system; noise levels share a cell."""
-    table = merit_table(cells, published, merit)
-    old = table.index.get_level_values(1).to_numpy()
-    table = table[
-        old | table.notna().any(axis=1).to_numpy()
-    ]  # others leave the selection to the user
-    digits = 2 if merit == "mean_correct_terms" else 0
-    shown = table.map(partial(places, n=digits)).T.groupby(level=0, sort=False).agg("/".join).T
-    shown.columns = [_heading(str(system), merit) for system in shown]
-    names = [f"{name}, thesis" if is_old else name for name, is_old in table.index]
-    cpu_ms = 1e3 * cells.groupby("variant")["cpu_s_per_search"].mean()
-    times = ["" if is_old else f"{cpu_ms[name]:.1f}" for name, is_old in table.index]
-    shown = shown.assign(**{"CPU (ms)": times}).reset_index(drop=True)
-    shown.insert(0, "variant", names)
-    return Table(
-        shown, TITLES[merit], italic=[k for k, (_, is_old) in enumerate(table.index) if is_old]
-    )
-
-
-def _heading(system: str, merit: str) -> str:
-    if merit != "mean_correct_terms":
-        return system
-    model = DRAWS[system](np.random.default_rng(0)).model
-    return f"{system} ({np.count_nonzero(model.coef)})"

@@ -22,7 +22,6 @@ from ep2sindy.studies.benchmark import Variant, build_variants, merits
 from ep2sindy.studies.study import Deferred, Names, Positives
 from ep2sindy.systems.systems import System
 
-TITLE = "Lowest sampling rate (Hz) from which on all rates identify the system, by duration"
 FIGURE = (
     "Filled: the true equations of all states are on the variant's fronts. Hollow: they are not. "
     "Cross: too few samples for the variant to run, which counts as not identified."
@@ -57,8 +56,6 @@ class Study:
         )
         report.figure("frontier", partial(frontier_figure, points), FIGURE)
         report.table("points", points, shown=False)
-        report.section(TITLE)
-        report.table("lowest_rates", lowest_rates(points))
         percent = 100.0 * by_variant["identified"].mean()
         report.headline |= {f"{n}/identified_percent": float(v) for n, v in percent.items()}
         fractions = "; ".join(f"{name} {fraction:.0f} %" for name, fraction in percent.items())
@@ -130,22 +127,3 @@ def _point(
             }
         )
     return rows
-
-
-def lowest_rates(points: pd.DataFrame) -> pd.DataFrame:
-    """One row per variant: number of identified points, then the lowest rates in Hz by duration.
-
-    The lowest rate is the one from which on all rates identify the system; NaN if there is none.
-    """
-    rows = []
-    for variant, of_variant in points.groupby("variant", sort=False):
-        row: dict[str, object] = {
-            "variant": variant,
-            "identified": f"{of_variant['identified'].sum()} of {len(of_variant)}",
-        }
-        for duration_s, column in of_variant.groupby("duration_s"):
-            falling = column.sort_values("rate_Hz", ascending=False)
-            unbroken = falling["identified"].cummin()
-            row[f"{duration_s:g} s"] = falling.loc[unbroken, "rate_Hz"].min()
-        rows.append(row)
-    return pd.DataFrame(rows)

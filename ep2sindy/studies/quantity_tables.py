@@ -25,7 +25,7 @@ MOST_LAWS = 3  # on the screen
 LEAST_POINTS = 3  # of a control law
 
 INTERVALS = (
-    "±: half the 95 % interval, a sandwich: of least squares with blocks of two periods as "
+    "Intervals of 95 % are sandwiches: of least squares with blocks of two periods as "
     "clusters, of refinements with windows. It says how far another segment of the same record "
     "would move a value, not how far the model is from the discharge: compare R2, and the fits. "
     "Nor does it hold the bias that smoothing and differencing leave in least squares, even "

@@ -20,7 +20,7 @@ from ep2sindy.library.library import named_terms
 from ep2sindy.library.relations import constraint
 from ep2sindy.regression.constrained import constrained_fit
 from ep2sindy.regression.rows import Formulation
-from ep2sindy.report.document import Result, Table, Text
+from ep2sindy.report.document import Result, Text
 from ep2sindy.report.report import Report
 from ep2sindy.runtime.parallel import Workers, rows_in_order
 from ep2sindy.runtime.progress import SILENT, Progress
@@ -68,7 +68,7 @@ class Study:
         report.figure("errors", draw, FIGURE)
         report.section("Coefficient error, mean over the realizations")
         note = "Without noise the error is that of the integrals and derivatives."
-        report.table("cells", cells, shown=Table(by_noise(cells), note=note))
+        report.table("cells", cells, note=note)
         report.samples("errors", errors)
         means = cells.to_dict("records")
         report.headline |= {
@@ -142,12 +142,3 @@ def error_cells(errors: pd.DataFrame, forms: Mapping[str, Formulation]) -> pd.Da
         values = [getattr(box, key) if box else None for box in boxes]
         cells.insert(place, key, pd.Series(values, dtype="Int64"))
     return cells
-
-
-def by_noise(cells: pd.DataFrame) -> pd.DataFrame:
-    """One row per form, one column of mean errors per noise level, as text."""
-    shown = cells.assign(noise=[f"{100 * noise:g} % noise" for noise in cells["noise"]])
-    table = shown.pivot(index="fit", columns="noise", values="error_mean")
-    order = [shown["fit"].unique(), shown["noise"].unique()]
-    texts = table.loc[order[0], order[1]].map("{:.2e}".format)
-    return texts.reset_index().rename_axis(columns=None)
