@@ -153,7 +153,7 @@ def test_other_settings_begin_anew(
         "+exp=benchmark", "systems=[oscillator]", "noises=[0.0]", "n_realizations=3",
         "variants=[STLSQ]", "parallel=serial",
     ]  # fmt: skip
-    monkeypatch.setattr(benchmark, "first_realizations", ends)
+    monkeypatch.setattr(benchmark, "cells", ends)
     for more in ([], ["seed=1"], ["verbose=true"], ["output=elsewhere"]):
         with pytest.raises(KeyboardInterrupt):
             computed(composed(*given, *more))

@@ -1,13 +1,8 @@
-"""Tables and figures of the benchmark, the frontier, and models of known systems.
-
-The benchmark is a table and a heat map of how often each variant finds the equations. Known
-systems are drawn next to the identified models, as attractors and trajectories.
-"""
+"""Figures of the benchmark, a heat map of how often each variant is right, and of the frontier."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -15,12 +10,8 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.figures import style
-from ep2sindy.figures.series import when_it_diverges
-from ep2sindy.figures.style import COLOURS, DATA, GREY, SMALL, TITLE, WIDTH, Curve, Limits
-from ep2sindy.library.equations import latex_name
-from ep2sindy.model.rollout import Rollout
+from ep2sindy.figures.style import COLOURS, GREY, SMALL, TITLE
 
 COUNTS = ("on_front", "selected")  # numbers of realizations
 
@@ -35,8 +26,6 @@ SYSTEM_LABELS = {
 
 PANELS = {"on_front": "true equations on the front", "selected": "true equations selected"}
 
-IDENTIFIED = COLOURS[1]
-
 MIN_WIDTH = 2.3  # of a heat map, in inches: its title stands above it
 
 # They differ by shape and filling, not by colour alone.
@@ -45,8 +34,6 @@ SIGNS: Mapping[str, Mapping[str, Any]] = {
     "not identified": {"marker": "o", "color": COLOURS[1], "mfc": "none"},
     "too few samples to run": {"marker": "x", "color": GREY, "ms": 4},
 }
-
-MAX_DOTS = 1500  # samples drawn in a panel
 
 
 def merit_table(cells: pd.DataFrame, published: pd.DataFrame, merit: str) -> pd.DataFrame:
@@ -130,71 +117,3 @@ def _draw_heat_map(ax: Axes, table: pd.DataFrame) -> None:
         places, label = np.flatnonzero(systems == system), SYSTEM_LABELS.get(system, system)
         ax.text(places.mean() + 0.5, -0.25, label, ha="center", va="bottom", fontsize=SMALL)
         ax.axvline(places[0], color="white", lw=5)
-
-
-@dataclass(frozen=True, eq=False)
-class Identified:
-    """One realization of a known system, and the model identified from it.
-
-    samples: noisy data of the fit. truth: noise-free, all states. rollout: run of the model from
-    the truth's initial state. right: whether the model has the true terms.
-    """
-
-    system: str
-    noise: float
-    samples: Trajectory
-    truth: Trajectory
-    rollout: Rollout
-    right: bool
-
-    def curves(self, over_time: bool) -> list[Curve]:
-        """Samples, truth and run: the first and the last state, or the first over time."""
-        parts = ((run.t, run.states) for run in (self.samples, self.truth, self.rollout))
-        return [(t if over_time else x[:, 0], x[:, 0 if over_time else -1]) for t, x in parts]
-
-
-def attractor_figure(found: Sequence[Identified], *, over_time: bool = False) -> Figure:
-    """A column per system, a row per noise level: samples, truth and identified model.
-
-    Panels show the plane of the first and the last state; with over_time, the first state over
-    time.
-    """
-    systems = list(dict.fromkeys(each.system for each in found))
-    noises = sorted({each.noise for each in found})
-    width, height = (3.4, 1.7) if over_time else (2.6, 2.5)
-    size = (min(WIDTH, width * len(systems) + 0.6), height * len(noises) + 0.9)
-    figure, axes = style.make_panels(len(noises), len(systems), size, sharex="col", sharey="col")
-    curves = [each.curves(over_time) for each in found]
-    for each, drawn in zip(found, curves, strict=True):
-        ax = axes[noises.index(each.noise), systems.index(each.system)]
-        alike = [of[0] for of, one in zip(curves, found, strict=True) if one.system == each.system]
-        x, y = (
-            style.frame_limits(np.concatenate(of), np.empty(0)) for of in zip(*alike, strict=True)
-        )
-        _draw_one(ax, each, drawn, (x, y))
-        first, last = (f"${latex_name(each.samples.state_names[k])}$" for k in (0, -1))
-        ax.set_ylabel(first if over_time else last, labelpad=1)
-        if each.noise == noises[-1]:
-            ax.set_xlabel("time (s)" if over_time else first)
-    for ax, system in zip(axes[0], systems, strict=True):
-        ax.set_title(f"{SYSTEM_LABELS.get(system, system)}\n{ax.get_title()}", fontsize=TITLE)
-    for ax, noise in zip(axes[:, 0], noises, strict=True):
-        ax.set_ylabel(f"noise {100 * noise:g} %\n\n{ax.get_ylabel()}")
-    style.legend_above(figure, axes[0, 0].lines[:3])
-    return figure
-
-
-def _draw_one(
-    ax: Axes, each: Identified, curves: Sequence[Curve], limits: tuple[Limits, Limits]
-) -> None:
-    """Draw samples as dots, the truth as a line, and the model as a line that hides neither."""
-    (x, y), truth, model = curves
-    step = -(-len(x) // MAX_DOTS)
-    ax.plot(x[::step], y[::step], ".", color=GREY, ms=3.5, mew=0, label="samples")
-    ax.plot(*truth, color=DATA, lw=1.6, label="truth")
-    ax.plot(*model, color=IDENTIFIED, lw=1.1, ls=(0, (4, 1.5)), label="identified model")
-    ax.set(xlim=limits[0], ylim=limits[1])
-    verdict = "true terms" if each.right else "other terms"
-    if each.rollout.diverged:
-        verdict += f", {when_it_diverges(each.rollout)}"
-    ax.set_title(verdict, fontsize=TITLE, color=DATA if each.right else IDENTIFIED)

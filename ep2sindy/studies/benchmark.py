@@ -18,21 +18,17 @@ import numpy as np
 import pandas as pd
 
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.method import Finding
-from ep2sindy.discovery.result import DiscoveryMethod
 from ep2sindy.figures.identified import (
     COUNTS,
     MERITS,
-    Identified,
-    attractor_figure,
     benchmark_figure,
 )
 from ep2sindy.library.library import Library
 from ep2sindy.report.document import Result, Text
 from ep2sindy.report.report import Report
 from ep2sindy.runtime.parallel import Workers, rows_in_order
-from ep2sindy.runtime.progress import SILENT, Progress, count_pieces
+from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.studies.resume import resumed
 from ep2sindy.studies.study import Count, Deferred, Levels, Names
 from ep2sindy.systems.draws import check_systems, realization
@@ -41,11 +37,6 @@ from ep2sindy.systems.systems import System
 FIGURE = (
     "Realizations in which all true equations are among the candidates (left), and are the ones "
     "selected (right), in %. A dash: the variant selects nothing, or N/A in the thesis."
-)
-EXAMPLES = (
-    "The first realization of every system and noise level: samples, truth, and the model that "
-    "{variant} selects, integrated from where the truth starts. True terms need not follow a "
-    "chaotic trajectory for long."
 )
 INTRODUCTION = (
     "Each realization draws an initial state, or for the Van der Pol oscillator its parameter, at "
@@ -139,27 +130,11 @@ class Study:
             )
             draw = partial(benchmark_figure, counted, thesis=published)
             report.figure("benchmark", draw, FIGURE)
-            self._add_examples(variants, report)
         add_tables(report, outcomes, counted, published)
         report.section("Variants")
         report.add(*(Text(f"{name}: {each}", page_only=True) for name, each in variants.items()))
         report.headline |= means(counted)
         report.found(best_variant(counted))
-
-    def _add_examples(self, variants: Mapping[str, Variant], report: Report) -> None:
-        """Draw what the last variant that makes models, if there is one, finds first."""
-        methods = {n: each for n, each in variants.items() if isinstance(each, DiscoveryMethod)}
-        if not methods:
-            return
-        variant, method = methods.popitem()
-        pairs = [*product(self.systems, sorted(self.noises))]
-        seed = [report.seed, 0, *variant.encode()]  # as in `assessed`
-        draw = self._draw(report.seed)
-        found = first_realizations(method, pairs, draw, seed=seed, progress=report.watch)
-        report.section(f"Identified by {variant}")
-        for name, over_time in (("attractors", False), ("trajectories", True)):
-            figure = partial(attractor_figure, found, over_time=over_time)
-            report.figure(name, figure, EXAMPLES.format(variant=variant))
 
     def outcomes(
         self, variants: Mapping[str, Variant], *, seed: int = 0, progress: Progress = SILENT
@@ -218,28 +193,6 @@ def cells(outcomes: pd.DataFrame) -> pd.DataFrame:
         n=("number", "count"),
         cpu_s_per_search=("cpu_s", "median"),
     ).reset_index()
-
-
-def first_realizations(
-    method: DiscoveryMethod,
-    pairs: Sequence[tuple[str, float]],
-    draw: Draw,
-    *,
-    seed: Sequence[int],
-    progress: Progress = SILENT,
-) -> list[Identified]:
-    """Models found in the first realizations of some systems and noise levels.
-
-    The search is the same as in the benchmark.
-    """
-    found = []
-    for label, noise in count_pieces(progress, pairs, "model", "first realizations"):
-        (system, runs), (_, (truth, *_)) = (draw(label, level, 0) for level in (noise, 0.0))
-        rng = np.random.default_rng(seed)
-        model = discover(runs, system.model.library, method, seed=rng, progress=progress).model
-        right = np.array_equal(model.coef != 0.0, system.model.coef != 0.0)
-        found.append(Identified(label, noise, runs[0], truth, model.rollout(truth), right))
-    return found
 
 
 def published_cells() -> pd.DataFrame:
