@@ -106,5 +106,5 @@ def test_one_state_has_no_phase_portrait(oscillation: ep.Trajectory) -> None:
     model = ep.SparseModel(ep.named_terms(("x",), ("x",)), ("x",), np.array([[-1.0]]))
     integrated = {"model": ep.evaluate(model, one)}
     report = Mock(Report)
-    add_figures(report, ("phase", "trajectories"), one, integrated, PlotRange(20.0, None))
+    add_figures(report, ("phase", "trajectories"), one, integrated, PlotRange(20.0))
     assert [call.args[0] for call in report.figure.mock_calls] == ["trajectories"]

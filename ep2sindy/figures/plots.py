@@ -28,7 +28,6 @@ from ep2sindy.runtime.values import check_positive
 from ep2sindy.signals.spectrum import dominant_frequency
 
 PERIODS = 20.0  # shown of a record that has more
-HARMONICS = 10.0  # shown of its spectrum
 
 
 def _show_in_notebooks() -> None:
@@ -105,12 +104,11 @@ def _(run: Trajectory, *, duration_s: float | None = None, f_max_Hz: float | Non
     for name, value in (("duration_s", duration_s), ("f_max_Hz", f_max_Hz)):
         if value is not None:
             check_positive(name, value)
-    whole_s, highest_Hz = float(run.t[-1] - run.t[0]), 0.5 / run.dt_s
+    whole_s = float(run.t[-1] - run.t[0])
     fastest_Hz = max(dominant_frequency(run.t, column) for column in run.states.T)
     if fastest_Hz > 0.0:
         whole_s = min(whole_s, PERIODS / fastest_Hz)
-        highest_Hz = min(highest_Hz, HARMONICS * fastest_Hz)
-    return data_figure(run, duration_s=duration_s or whole_s, f_max_Hz=f_max_Hz or highest_Hz)
+    return data_figure(run, duration_s=duration_s or whole_s, f_max_Hz=f_max_Hz)
 
 
 @plot.register

@@ -31,12 +31,20 @@ from ep2sindy.signals.spectrum import dominant_frequency, power_spectrum
 
 SINCE_START = "time since start of integration"
 
+HARMONICS = 10.0  # of the fastest state, up to which spectra are drawn
+
 LABEL = 18  # letters in a line of a model's label next to or above its panel
 RARE = 0.01  # fraction of derivative samples, low or high, kept out of the scale as edge spikes
 
 
-def data_figure(run: Trajectory, *, duration_s: float, f_max_Hz: float) -> Figure:
-    """A row per state: its first `duration_s`, and its power spectrum up to `f_max_Hz`."""
+def data_figure(run: Trajectory, *, duration_s: float, f_max_Hz: float | None = None) -> Figure:
+    """A row per state: its first `duration_s`, and its power spectrum up to `f_max_Hz`.
+
+    f_max_Hz: None means harmonics of the fastest state, up to half the sampling rate.
+    """
+    if f_max_Hz is None:
+        peaks_Hz = [dominant_frequency(run.t, column) for column in run.states.T]
+        f_max_Hz = min(0.5 / run.dt_s, HARMONICS * float(np.nanmax([0.0, *peaks_Hz])) or np.inf)
     n = len(run.state_names)
     figure, axes = style.make_panels(n, 2, (WIDTH, 2.2 * n + 0.6), sharex="col", widths=[3, 2])
     states = first_part(run.t, run.states, duration_s, run.clock)

@@ -38,25 +38,14 @@ CAPTIONS = {
 }
 
 
-HARMONICS = 20.0  # of the largest dominant frequency, up to which spectra are drawn
-
-
 @dataclass(frozen=True)
 class PlotRange:
-    """The range that figures show: the start of a record, and the low end of spectra."""
+    """The range that figures show: the start of a record."""
 
     duration_s: PositiveOrAll
-    f_max_Hz: PositiveOrAll
 
     def span_s(self, data: Trajectory) -> float:
         return self.duration_s or float(data.t[-1] - data.t[0])
-
-    def up_to_Hz(self, data: Trajectory) -> float:
-        """The end of spectra: harmonics of the fastest state, up to half the sampling rate."""
-        if self.f_max_Hz:
-            return self.f_max_Hz
-        peaks = [dominant_frequency(data.t, column) for column in data.states.T]
-        return min(0.5 / data.dt_s, HARMONICS * float(np.nanmax([0.0, *peaks])) or np.inf)
 
 
 def add_samples(report: Report, data: Trajectory, runs: Mapping[str, Evaluation]) -> None:
@@ -87,11 +76,11 @@ def add_figures(
     since: the origin of the time axis of runs, in words. suffix: to the names, for runs of another
     kind, which CAPTIONS describes by such a name.
     """
-    span, f_max_Hz = shown.span_s(data), shown.up_to_Hz(data)
+    span = shown.span_s(data)
     rollouts = {name: run.rollout for name, run in runs.items()}
     how = {"statuses": {name: run.status for name, run in runs.items()}}
     drawn: dict[str, Callable[[], Figure]] = {
-        "data": partial(series.data_figure, data, duration_s=span, f_max_Hz=f_max_Hz),
+        "data": partial(series.data_figure, data, duration_s=span),
         "trajectories": partial(
             series.trajectory_figure, data, rollouts, duration_s=span, since=since, **how
         ),
