@@ -23,7 +23,8 @@ EMPTY = """
   const pixels = new Uint32Array(
     context.getImageData(0, 0, canvas.width, canvas.height).data.buffer);
   return new Set(pixels).size < 8;
-}).length
+}).length + [...document.querySelectorAll('figure svg')].filter(
+  svg => [...svg.querySelectorAll('path')].filter(p => p.getBBox().width > 0).length < 8).length
 """
 
 
@@ -133,7 +134,6 @@ async def _seen(
     while not await value("location.href != 'about:blank' && document.readyState == 'complete'"):
         await asyncio.sleep(0.1)
     found.scroll_px = await value("document.documentElement.scrollWidth")
-    found.figures = await value("document.querySelectorAll('figure img').length")
     found.empty = await value(EMPTY)
     found.answers = {name: await value(text) for name, text in questions.items()}
     socket.close()

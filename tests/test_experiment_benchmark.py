@@ -57,12 +57,6 @@ def test_the_thesis_stands_next_to_our_cells(toy_run: Path) -> None:
     assert len(pd.read_csv(toy_run / "tables" / "outcomes.csv")) == 8
 
 
-def test_the_page_shows_both(toy_run: Path) -> None:
-    page = (toy_run / "report.html").read_text()
-    assert 'id="figure-benchmark"' in page
-    assert "thesis_on_front</th>" in page
-
-
 def test_the_published_tables_are_those_of_the_thesis() -> None:
     table = published_cells().set_index(["variant", "system", "noise"])
     assert len(table) == 4 * 4 * 3

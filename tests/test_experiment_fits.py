@@ -138,11 +138,6 @@ def test_refinements_return_predator_and_prey(predator_prey: Path, tmp_path: Pat
         assert (spread["n_draws"], spread["n_sustained"]) == (2, 2)
         assert spread["f_error"] == pytest.approx([0.0, 0.0], abs=1e-3)
         assert 0.0 <= spread["waveform"][0] <= spread["waveform"][1] < 1e-2
-    assert found.page.count("95 % from") == 2  # of the refinements
-    assert "95 % from" not in found.log
-    events = b"".join(p.read_bytes() for p in (found.folder / "tensorboard").glob("events*"))
-    for tag in (b"refined/scaling/n_i/n_i.n_n", b"refined_constrained/loss"):
-        assert tag in events
     found.check_figures("loss_against_window", "phase")
 
 

@@ -100,8 +100,6 @@ def test_tables_figures_and_page_are_written(folder: Path) -> None:
     assert at["thesis"][200.0, 5.0, "constrained", "g_inj"] == 2.72e23
     assert at["thesis"][300.0, 2.0, "free", "eps_n"] == 0.67
     assert np.isnan(at["thesis"][300.0, 2.0, "free_refined", "eps_n"])
-    for name in ("points", "fits", "coefficients", "control_laws", "laws", "law_coefficients"):
-        assert len(pd.read_csv(folder / "tables" / f"{name}.csv"))
     trials = pd.read_csv(folder / "tables" / "trials.csv")
     assert (trials["fit"].tolist(), trials["chosen"].sum()) == (FITS, 1)
 
@@ -153,8 +151,6 @@ def test_own_files_and_points_that_do_not_oscillate(tmp_path: Path) -> None:
     assert np.isnan(found.report.headline["free/L_m/search_error"])
     (warning,) = [text for text in found.warnings if "no law of whole models" in text]
     assert "2 points that oscillate get no law" in warning
-    stated = " ".join(found.log.split())
-    assert "None: a law needs 3 points, and all parameters to vary over them" in stated
 
 
 def test_nothing_that_oscillates_is_a_result(tmp_path: Path) -> None:

@@ -74,8 +74,6 @@ def test_the_file_holds_every_map(toy_run: Path) -> None:
 def test_points_and_figures_go_to_tensorboard(toy_run: Path) -> None:
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-    for name in ("coefficients", "regimes", "quality"):
-        assert (toy_run / "figures" / f"{name}.png").stat().st_size > 5e3
     events = EventAccumulator(str(toy_run / "tensorboard")).Reload()
     assert {"coefficients", "regimes", "quality"} <= set(events.Tags()["images"])
 

@@ -15,7 +15,6 @@ from ep2sindy.figures.operating import (
     WRONG,
     cycle_figure,
     laws_figure,
-    trends_figure,
 )
 from ep2sindy.library.library import named_terms, polynomial
 from ep2sindy.operating.law import OperatingLaw
@@ -53,11 +52,6 @@ def spots(ax: Axes) -> dict[tuple[float, ...], tuple[str, str]]:
         )
         for edge in marks.get_edgecolor()[:1]
     }
-
-
-@pytest.mark.parametrize(("scale", "unit"), [(1.0, "kHz"), (1e-5, "mHz"), (1e5, "GHz")])
-def test_frequencies_have_a_unit_in_which_they_are_near_one(scale: float, unit: str) -> None:
-    assert frequency_scale(pd.Series([10.0, 11.0, 12.0]) * scale)[1] == unit
 
 
 def grid(n: int) -> pd.DataFrame:

@@ -1,4 +1,4 @@
-"""Given models fitted to every operating point, the quantities that they mean, and their laws."""
+"""Given models fitted to every operating point, the quantities that they mean, and their trends."""
 
 import re
 from collections.abc import Sequence

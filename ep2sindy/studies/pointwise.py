@@ -207,7 +207,7 @@ def _add_regime(report: Report, regimes: Regimes, regime: int) -> None:
         level=3,
     )
     held = rows[rows["in_support"] > 0.0]
-    fractions = [f"{fraction:.0%}" for fraction in held["in_support"]]
+    fractions = [f"{100.0 * fraction:.0f} %" for fraction in held["in_support"]]
     shown = held.assign(equation=held["equation"] + "'", in_support=fractions)
     shown = shown[[*HEADINGS]].rename(columns=HEADINGS)
     report.add(Table(shown, bold=np.flatnonzero(held["acts"]).tolist()))
