@@ -84,9 +84,9 @@ def test_runs_of_one_setting_say_so(
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("nowhere", "a run is a folder: .*nowhere is not there; runs there are, for example"),
-        ("early", "early has no summary.json: it ended early, see its run.log; runs there"),
-        ("empty", "empty has no summary.json: no run; runs there are, for example"),
+        ("nowhere", "a run must be a folder: there is no .*nowhere; there are runs such as"),
+        ("early", "early has no summary.json: it ended early, see its run.log; there are runs"),
+        ("empty", "empty has no summary.json: no run; there are runs such as"),
     ],
 )
 def test_what_is_no_run_is_named_with_the_way_out(

@@ -90,7 +90,7 @@ def test_a_record_in_which_nothing_moves_tells_neither() -> None:
     data_warning = report_unknown_drive(signal)
     assert data_warning is not None
     assert data_warning.startswith(
-        "this record does not tell whether x sustains itself or is driven"
+        "this record does not show whether x sustains itself or is driven"
     )
 
 

@@ -208,7 +208,7 @@ def test_a_joint_search_says_what_the_samples_say(years: Computed) -> None:
         None,
     )
     stated = " ".join(years.log.split())
-    assert "The model explains the samples as far as their noise" in stated
+    assert "The model explains the samples to within their noise" in stated
     assert "95 % from" in years.page
 
 

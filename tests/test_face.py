@@ -74,9 +74,13 @@ def test_editors_and_type_checkers_see_the_names(tmp_path: Path) -> None:
         (
             "ep2sindy",
             "Eebic",
-            r"no attribute 'Eebic'; see dir\(ep2sindy\); near it (is|are) ep2sindy.EBIC",
+            r"no attribute 'Eebic'; see dir\(ep2sindy\) \(did you mean .*ep2sindy.EBIC",
         ),
-        ("ep2sindy.thruster", "crop", r"see dir\(ep2sindy.thruster\); near it is .*data.crop$"),
+        (
+            "ep2sindy.thruster",
+            "crop",
+            r"dir\(ep2sindy.thruster\) \(did you mean .*data.crop\?\)$",
+        ),
         ("ep2sindy", "_nothing", r"no attribute '_nothing'; see dir\(ep2sindy\)$"),
     ],
 )

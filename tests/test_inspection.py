@@ -199,7 +199,7 @@ def test_columns_of_one_array_are_signals_of_their_own(tmp_path: Path) -> None:
     [
         ("probe[:, 2]", r"must lie inside its array: 'probe' has shape \(40, 2\), counted from 0"),
         ("probe[:, a]", "has no variable 'probe"),
-        ("prob", "has no variable 'prob' .*; near it is 'probe'"),
+        ("prob", r"has no variable 'prob' .* \(did you mean 'probe'\?\)"),
         ("probe[0:2, 1]", r"written like \[:, 1\]"),
     ],
 )
@@ -296,7 +296,7 @@ def test_all_that_is_wrong_with_a_mapping_is_stated_at_once(tmp_path: Path) -> N
         )
     text = str(caught.value)
     for part in (
-        "no variable 'nii' (wanted as n_i); near it is 'ni'", "no variable 'nn'", "got 'kg'",
+        "no variable 'nii' (wanted as n_i) (did you mean 'ni'?)", "no variable 'nn'", "got 'kg'",
         "T_e_eV must fit the grid: the file has shape (10, 7)", "ni (40, 7)",
     ):  # fmt: skip
         assert part in text, part

@@ -268,7 +268,7 @@ def npz(path: Path, **changes: np.ndarray) -> Path:
         (
             {},
             {"variables": {"n_i": Variable("nii", "m^-3")}},
-            r"no variable 'nii' .*; near it .*'ni'.*; it holds t \(6\), z \(4\), r \(3\), ",
+            r"no variable 'nii' .* \(did .*'ni'.*\?\); it holds t \(6\), z \(4\), r \(3\), ",
         ),
         ({}, {"variables": {"n_i": Variable(None, "m^-3")}}, "none of .* has a name"),
         ({}, {"variables": {"n_i": {"nmae": "ni", "unit": "m^-3"}}}, "n_i needs a name, a unit"),

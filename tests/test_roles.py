@@ -174,7 +174,7 @@ def test_what_is_stated_is_kept_next_to_what_is_found(record):
     ]  # fmt: skip
     assert found.model.terms("n_n")["n_n"] == pytest.approx(-S - B, rel=1e-3)
     assert found.model.terms("n_i")["n_i"] == -A
-    with pytest.raises(ValueError, match="'n_n out' is not known of this record"):
+    with pytest.raises(ValueError, match="'n_n out' is not known for this record"):
         roles.with_known({"n_n in": {"1": M}})
     wrong = replace(ROLES, outflow={"n_i": {"n_n*n_i": 1.0}})
     with pytest.raises(ValueError, match=r"as the library does, 'n_i\*n_n'"):

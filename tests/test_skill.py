@@ -62,13 +62,13 @@ def test_a_close_model_that_is_no_better_says_how_long_it_is_close() -> None:
 def test_errors_above_the_mean_s_are_no_forecast() -> None:
     found = skill(model=errors(1.5), autoregression=errors(3.0, seed=1))
     assert not found.is_better
-    assert "the mean of the record is nearest" in found.text
+    assert "the mean of the record is best" in found.text
 
 
 def test_what_is_nearest_is_named() -> None:
     both = {"model": errors(0.3), "autoregression": errors(0.2, seed=1)}
     assert skill(**both, harmonics=errors(0.1, seed=2)).text == (
-        "no better than an autoregression (AR 3); the mean cycle is nearest"
+        "no better than an autoregression (AR 3); the mean cycle is best"
     )
     better = {"model": errors(0.2), "autoregression": errors(0.3, seed=1)}
     assert skill(**better, neighbours=errors(0.1)).text.endswith(
