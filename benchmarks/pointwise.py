@@ -6,7 +6,6 @@ bootstrap, `lstsq` for every support found), and PySINDy's `EnsembleOptimizer` (
 thresholds; both are given rows that are ready, and only a few points of the same grid.
 
     python -m benchmarks.pointwise [--folder where 1 GB fits]
-    python -m benchmarks.pointwise --cluster   # 100,000 points: a dask cluster of two workers
 """
 
 import argparse
@@ -36,7 +35,7 @@ from ep2sindy.regression.bootstraps import Bootstraps
 from ep2sindy.regression.formulations import Differential
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.searches import BestSubset
-from ep2sindy.runtime.parallel import ONE_BY_ONE, Dask, Workers
+from ep2sindy.runtime.parallel import ONE_BY_ONE, Workers
 from ep2sindy.selection.criteria import Knee
 
 N_Z, N_R, N_SAMPLES, DT_S = 41, 49, 12001, 1.5e-6
@@ -174,34 +173,14 @@ def compare(path: Path) -> None:
         print(f"  {name:<25} {1e3 * each:8.0f} ms per point, {each / ours:.0f} times")
 
 
-def cluster(path: Path) -> None:
-    """Wall time of a large grid: serial, and on a local dask cluster of two workers."""
-    from distributed import LocalCluster
-
-    field = read_field(path)
-    n_points, n_samples = field.sizes["z"] * field.sizes["r"], field.sizes["time"]
-    print(f"{n_points} points x {n_samples} samples, {path.stat().st_size / 1e9:.2f} GB on disk")
-    begin = time.perf_counter()
-    alone = study(field)
-    print(f"  serial                    {time.perf_counter() - begin:8.1f} s")
-    begin = time.perf_counter()
-    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as two:
-        start_s = time.perf_counter() - begin
-        shared = study(field, Dask(two.scheduler_address))
-    print(f"  two workers               {time.perf_counter() - begin:8.1f} s", end=" ")
-    print(f"(of it {start_s:.1f} s for their start); the same: {alone.identical(shared)}")
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description="the pointwise study at full size, on one core")
     parser.add_argument("--folder", type=Path, default=None, help="where 1 GB fits")
-    parser.add_argument("--cluster", action="store_true", help="100,000 points on dask")
     given = parser.parse_args()
     with tempfile.TemporaryDirectory(dir=given.folder) as made, threadpool_limits(limits=1):
         path = Path(made) / "grid.nc"
-        size = (316, 317, 501) if given.cluster else (N_Z, N_R, N_SAMPLES)
-        write_grid(path, np.random.default_rng(0), *size)
-        cluster(path) if given.cluster else compare(path)
+        write_grid(path, np.random.default_rng(0), N_Z, N_R, N_SAMPLES)
+        compare(path)
 
 
 if __name__ == "__main__":

@@ -83,8 +83,7 @@ TOYS: dict[str, list[str]] = {
     ],
     "simulate": [
         "+exp=simulate", "data.cache={cache}", "data.duration_s=6.0e-4", "data.warm_up_s=1.0e-4",
-        "data.n_cells=24", "data.progress=false", "parallel=serial",
-        "scan={{operating_point.voltage:[250.0,300.0]}}",
+        "data.n_cells=24", "data.progress=false",
     ],
 }  # fmt: skip
 # Programs that write tables into the folder they are given.

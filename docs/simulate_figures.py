@@ -12,13 +12,7 @@ from pathlib import Path
 
 DOCS = Path(__file__).resolve().parent
 ONE = ["+exp=simulate", "data.progress=false"]
-SCAN = [
-    "+exp=simulate",
-    "data.duration_s=3.0e-3",
-    "scan={operating_point.voltage:[150,200,250,300,350,400],"
-    "thruster.transport.c_plume:[0.008,0.011,0.0145,0.018]}",
-]
-FIGURES = {"maps": ONE, "profiles": ONE, "stability": SCAN}
+FIGURES = {"maps": ONE, "profiles": ONE}
 
 
 def main(overrides: list[str]) -> None:

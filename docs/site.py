@@ -19,7 +19,6 @@ from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 from nbclient import NotebookClient
 
-from docs.docstrings import first_sentence
 from ep2sindy._stubs import Entry, dotted_names
 
 CONTENTS = """# Reference
@@ -99,14 +98,15 @@ def _page(title: str, names: list[str]) -> str:
 
 
 def _contents() -> str:
-    """All names with their first sentence, page by page."""
+    """All names with the first line of their docstring, page by page."""
     names = dotted_names()
     lines = [CONTENTS]
     for title, here in reference().items():
         lines += [f"## [{title}]({_path(title)})", "", "| name | what it is |", "|---|---|"]
         for name in here:
             link = f"[`{name.removeprefix('ep2sindy.')}`][{name}]"
-            lines.append(f"| {link} | {first_sentence(docstring(names[name]))} |")
+            summary = docstring(names[name]).partition("\n")[0]
+            lines.append(f"| {link} | {summary} |")
         lines.append("")
     return "\n".join(lines)
 

@@ -5,7 +5,6 @@ import json
 import shutil
 import subprocess
 import tempfile
-from base64 import b64decode
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -38,7 +37,6 @@ class Seen:
 
     width_px: int
     scroll_px: int = 0
-    figures: int = 0
     empty: int = 0
     asked: list[str] = field(default_factory=list)
     console: list[str] = field(default_factory=list)
@@ -57,13 +55,12 @@ def seen(
     width_px: int,
     *,
     questions: dict[str, str] | None = None,
-    picture: Path | None = None,
 ) -> Seen:
     """Open a page, a file or an address, at this width.
 
     questions: expressions of JavaScript, by name.
     """
-    pytest.importorskip("tornado", reason="talks to Chromium; comes with `distributed`")
+    pytest.importorskip("tornado", reason="talks to Chromium; comes with `ipykernel`")
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
         process = subprocess.Popen(
             [
@@ -75,9 +72,7 @@ def seen(
         )  # fmt: skip
         try:
             url = page if isinstance(page, str) else page.resolve().as_uri()
-            return asyncio.run(
-                _seen(process, Path(profile), url, width_px, questions or {}, picture)
-            )
+            return asyncio.run(_seen(process, Path(profile), url, width_px, questions or {}))
         finally:
             process.kill()
             process.wait()
@@ -89,7 +84,6 @@ async def _seen(
     url: str,
     width_px: int,
     questions: dict[str, str],
-    picture: Path | None,
 ) -> Seen:
     """It waits for what the browser says, however long that takes, until the browser ends."""
     from tornado.httpclient import AsyncHTTPClient
@@ -140,11 +134,7 @@ async def _seen(
     while not await value("location.href != 'about:blank' && document.readyState == 'complete'"):
         await asyncio.sleep(0.1)
     found.scroll_px = await value("document.documentElement.scrollWidth")
-    found.figures = await value("document.querySelectorAll('figure img, figure svg').length")
     found.empty = await value(EMPTY)
     found.answers = {name: await value(text) for name, text in questions.items()}
-    if picture is not None:
-        shot = await call("Page.captureScreenshot", captureBeyondViewport=True, format="png")
-        picture.write_bytes(b64decode(shot["data"]))
     socket.close()
     return found

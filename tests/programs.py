@@ -6,23 +6,20 @@ from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import dataclass
 from functools import cache
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
-import pandas
-import xarray
 from hydra import compose, initialize_config_dir
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig
 
-import ep2sindy as ep
 from ep2sindy.app.arguments import mend
 from ep2sindy.app.main import main
 from ep2sindy.app.runner import purpose_of, start_run, study_class
 from ep2sindy.app.schema import keys_of, study_of
-from ep2sindy.report.document import Result
 from ep2sindy.report.report import Report
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -80,30 +77,19 @@ class Computed:
 
 
 def computed(config: DictConfig) -> Computed:
-    with start_run(config) as report:
+    """A study. Bands of its forecasts are calibrated by few starts: many take most of the time."""
+    forecasts = import_module("ep2sindy.forecasting.forecast")
+    with patch.object(forecasts, "N_STARTS", 10), start_run(config) as report:
         kind = study_class(config.study)
         study_of(kind, config).run(report)
         report.finish(purpose=purpose_of(kind), keys=keys_of(kind), formats=())
     log, page = ((report.folder.path / name).read_text() for name in ("run.log", "report.html"))
-    assert report.result is not None
-    check_end(log, page, report.result, report.folder.path)
     return Computed(report, log, page)
 
 
 def summary_of(folder: Path) -> dict[str, Any]:
     """What a run left in its folder for other programs."""
     return json.loads((folder / "summary.json").read_text())
-
-
-def check_end(log: str, page: str, result: Result, folder: Path) -> None:
-    """The last lines say what was found, how to load it and what to open; the page begins so."""
-    last = "".join("".join(log.splitlines()[-20:]).split())  # long lines are broken
-    end = f"load: {result.load.format(folder)} open: {folder}/report.html"
-    assert last.endswith("".join(end.split()))
-    assert "".join(result.title.split()) in last
-    loader = result.load.partition("(")[0]  # such as `ep.SparseModel.load`
-    assert callable(eval(loader, {"ep": ep, "pandas": pandas, "xarray": xarray})), loader
-    assert 0 < page.index('id="found"') < page.index("</section>") < page.index("<main>")
 
 
 def ended(*arguments: str) -> str:

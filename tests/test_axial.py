@@ -141,21 +141,13 @@ def test_a_restart_at_another_operating_point_is_a_continuation(run):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        
         (lambda run: brief(
             ep.thruster.Thruster(propellant=ep.thruster.propellant("krypton")), initial=run),
          r"only in the same thruster: propellant was"),
-        (lambda run: brief(initial=run.assign_attrs(status="diverged")),
-         r"only from one that did not diverge, .* start from ColdStart or SoftStart"),
-        (lambda run: brief(initial=run[["n_i"]]), r"must be a run of simulate, which keeps"),
-        (lambda run: brief(initial="there/is/none.nc"), r"no such run to continue from: /"),
-        
-        (lambda run: brief(cfl=1.5), r"cfl must be above 0 and at most 1, got 1\.5"),
-        (lambda run: ep.thruster.SoftStart(resistance=-1.0),
-         r"SoftStart\.resistance must be .* positive"),
+        (lambda run: brief(initial=run.assign_attrs(status="diverged")), r"did not diverge"),
+        (lambda run: brief(initial=run[["n_i"]]), r"must be a run of simulate"),
         (lambda run: ep.thruster.zone_balance(run, (0.03, 0.0498)),
          r"must end before the last cell"),
-        (lambda run: ep.thruster.zone_balance(run[["n_i"]], ZONE), r"this field lacks \['n_n'\]"),
     ],
 )  # fmt: skip
 def test_bad_input_says_the_way_out(run, make, message):

@@ -78,17 +78,8 @@ def test_a_speed_of_the_neutrals_follows_its_table() -> None:
     np.testing.assert_array_equal(POINT.neutral_speed_at(Z), POINT.neutral_speed)
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: ep.thruster.Background(-1.0), "pressure_Pa must be finite and zero or more"),
-        (lambda: replace(SHIFT, alpha=1.0), "PressureShift.alpha must be above 1, got 1.0"),
-        (lambda: replace(SHIFT, dz=math.nan), "z0 and dz must be finite, in channel lengths"),
-        (lambda: ep.thruster.NeutralSpeed([0.0, 0.0], [1.0, 1.0]), "distance must increase"),
-        (lambda: ep.thruster.NeutralSpeed([0.0, 1.0], [1.0]), "must have one number for each"),
-        (lambda: ep.thruster.NeutralSpeed([0.0, 1.0], [1.0, 0.0]), "everywhere, got 0 m/s"),
-    ],
-)
-def test_what_cannot_be_is_refused(make, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        make()
+def test_what_cannot_be_is_refused() -> None:
+    with pytest.raises(ValueError, match="pressure_Pa must be finite and zero or more"):
+        ep.thruster.Background(-1.0)
+    with pytest.raises(ValueError, match="everywhere, got 0 m/s"):
+        ep.thruster.NeutralSpeed([0.0, 1.0], [1.0, 0.0])

@@ -144,8 +144,3 @@ def test_nothing_but_the_past_enters() -> None:
     for baseline in found.values():
         ours, theirs = (go_on(baseline, record(each), starts, 20) for each in (x, later))
         np.testing.assert_array_equal(ours, theirs)
-
-
-def test_parts_that_are_too_short_are_refused() -> None:
-    with pytest.raises(ValueError, match="got n_fitted=599 for 600 samples"):
-        baseline_errors(record(oscillator(600)), ["x"], n_fitted=599, longest=2)

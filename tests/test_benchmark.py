@@ -8,7 +8,6 @@ import pytest
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.method import Finding, Regression, TrajectorySearch
-from ep2sindy.figures.identified import merit_table
 from ep2sindy.library.library import Library
 from ep2sindy.regression.bootstraps import Bootstraps
 from ep2sindy.regression.formulations import Differential
@@ -140,38 +139,6 @@ def test_this_packages_path_is_a_variant_and_keeps_the_empty_support() -> None:
     assert all(kept[0] == frozenset() for kept in found.kept.values())
 
 
-@pytest.mark.parametrize("settings", [{"n_realizations": 0}, {"noises": []}, {"variants": {}}])
-def test_a_benchmark_of_nothing_is_refused(settings: dict) -> None:
-    with pytest.raises(ValueError, match="there must be something to run"):
-        outcomes_of(**({"variants": {"STLSQ": STLSQ_}} | settings))
-
-
-def made_up_cells() -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Ours: two variants, two systems, two noise levels; published: one of them, and more."""
-    place = [(s, noise) for s in ("oscillator", "lorenz") for noise in (0.0, 0.2)]
-    rows = [(*p, v) for p in place for v in ("ours", "STLSQ")]
-    ours = pd.DataFrame(rows, columns=["system", "noise", "variant"]).assign(
-        on_front=np.arange(8.0), selected=np.nan, mean_correct_terms=2.5, n=10, cpu_s_per_search=1.0
-    )
-    published = ours[ours["variant"] == "STLSQ"].drop(columns="cpu_s_per_search")
-    published = published.assign(on_front=25.0, selected=5.0, n=50)
-    strangers = published.assign(variant="wALASSO"), published.assign(noise=0.7)
-    return ours, pd.concat([published, *strangers])
-
-
-def test_a_table_puts_the_published_row_below_its_variant() -> None:
-    ours, published = made_up_cells()
-    table = merit_table(ours, published, "on_front")
-    assert table.index.tolist() == [("ours", False), ("STLSQ", False), ("STLSQ", True)]
-    systems = ["oscillator", "oscillator", "lorenz", "lorenz"]
-    assert table.columns.tolist() == list(zip(systems, [0.0, 0.2, 0.0, 0.2], strict=True))
-    assert table.to_numpy().tolist() == [[0, 20, 40, 60], [10, 30, 50, 70], [50, 50, 50, 50]]
-    terms = merit_table(ours, published, "mean_correct_terms")
-    assert (terms.to_numpy() == 2.5).all()
-    alone = merit_table(ours, published.iloc[:0], "on_front")
-    assert alone.index.tolist() == [("ours", False), ("STLSQ", False)]
-
-
 def test_a_search_of_trajectories_finds_what_its_rule_selects() -> None:
     system, runs = realization("lotka_volterra", 0.05, 0, n_trajectories=1, seed=0)
     library = system.model.library
@@ -195,8 +162,3 @@ def test_a_wider_library_holds_the_same_model() -> None:
         assert wider.model.terms(state) == system.model.terms(state)
     with pytest.raises(ValueError, match=r"terms of Lorenz, of degree 2 or more, got degree=1"):
         realization("lorenz", 0.0, 0, degree=1)
-
-
-def test_systems_that_there_are_not() -> None:
-    with pytest.raises(ValueError, match=r"unknown systems \['Lorentz'\]; there are"):
-        outcomes_of(systems=["lorenz", "Lorentz"], variants={"STLSQ": STLSQ_})

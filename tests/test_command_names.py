@@ -1,9 +1,6 @@
 """Names of files, folders and columns with any signs, as they are typed and as they are printed."""
 
-import os
 import shlex
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +8,7 @@ import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from ep2sindy.app.arguments import mend
-from tests.programs import ROOT
+from tests.programs import ended
 
 NAMES = [
     "dä.csv", "run(1).csv", "a b.csv", "日本.csv", "it's.csv", 'q"q.csv', "x=1.csv", "a&b.csv",
@@ -49,21 +46,17 @@ def test_a_comma_parts_jobs_of_a_sweep_unless_it_stands_in_a_name() -> None:
     assert value_of("data.path=a,b.csv") == "a,b.csv"
 
 
-def test_what_inspect_prints_is_pasted_into_a_shell_and_runs(tmp_path: Path) -> None:
+@pytest.mark.usefixtures("here")
+def test_what_inspect_prints_is_pasted_into_a_shell_and_runs(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     name = "it's (1) ä$a&b;日本.csv"
     t = 1e-6 * np.arange(300)
     rows = np.column_stack([t, 2.0 + np.sin(1e5 * t), 2.0 + np.cos(1e5 * t)])
-    np.savetxt(tmp_path / name, rows, delimiter=",", header="t_s,Düse_ä,b", comments="")
-    program = shlex.join([sys.executable, "-m", "ep2sindy.app.main"])
-
-    def shell(command: str) -> str:
-        found = os.environ | {"PYTHONPATH": str(ROOT)}
-        run = subprocess.run(
-            command, shell=True, cwd=tmp_path, env=found, capture_output=True, text=True, check=True
-        )
-        return run.stdout
-
-    shown = shell(f"{program} inspect {shlex.quote(name)}").splitlines()
+    np.savetxt(name, rows, delimiter=",", header="t_s,Düse_ä,b", comments="")
+    assert not ended("inspect", name)
+    shown = capsys.readouterr().out.splitlines()
     (line,) = (each.strip() for each in shown if "+exp=discover data" in each)
-    found = shell(f"{line.replace('ep2sindy', program, 1)} forecasts=0 output=Ergebnisse_für")
-    assert "Düse_ä' = " in found
+    printed = shlex.split(line)[1:]
+    assert not ended(*printed, "forecasts=0", "output=Ergebnisse_für")
+    assert "Düse_ä' = " in capsys.readouterr().out

@@ -108,14 +108,8 @@ def test_relations_are_read(text: str, factors: list[tuple[float, str, str]], va
     ("text", "message"),
     [
         ("x: x", "two sides joined by one '=='"),
-        ("1 == 2", "must name a coefficient, got '1 == 2'"),
         ("x: x == 1e999", "must be finite, got 'x: x == 1e999'"),
-        (
-            "x: x == ",
-            r"a number must stand at character 9 of the relation 'x: x == ', got 'the end'",
-        ),
         ("x: x y: y == 0", r"\+, -, == or the end must stand at character 6 .*'y: y == 0'"),
-        ("x: x + 2 * foo == 0", r"character 10 .*'\* foo == 0'; write it like 'n_i: n"),
     ],
 )
 def test_unreadable_relations_are_quoted_with_the_position(text: str, message: str) -> None:
@@ -175,10 +169,7 @@ def test_a_chain_of_ties_keeps_the_first_coefficient_free() -> None:
         ([TIED, "2 * x: x*y + 2 * y: x*y == 1"], r"== 1' contradicts the earlier ones, \['x: x\*y"),
         (["0.1 * x: x + 0.2 * y: y == 0.3", "x: x + 2 * y: y == 3"], "y: y == 3' is redundant"),
         (["x: x*y == x: y*x"], "is redundant: it is implied by arithmetic alone"),
-        (["x: x*y == x: y*x + 1"], "contradicts arithmetic alone"),
         (["x: y == 0"], r"relation 'x: y == 0': 'y' is not in the support of 'x', \['x', 'x\*y'\]"),
-        (["z: y == 0"], r"relation 'z: y == 0': unknown state 'z'; .* for \['x', 'y'\]"),
-        (["x: y^3 == 0"], r"relation 'x: y\^3 == 0': unknown term 'y\^3'"),
     ],
 )
 def test_relations_are_refused_by_name(relations: list[str], message: str) -> None:
@@ -333,12 +324,6 @@ def test_rows_that_cannot_tell_coefficients_apart_are_refused_unless_a_relation_
         constrained_fit(problems, constraint(LIBRARY, support))
     model = constrained_fit(problems, constraint(LIBRARY, support, ["x: x == x: y"]))
     assert model.terms("x")["x"] == pytest.approx(1.0 / 3.0, abs=0.05)
-
-
-def test_a_state_without_rows_is_named() -> None:
-    c = constraint(LIBRARY, {"z": ["x"]})
-    with pytest.raises(ValueError, match=r"unknown state 'z'; these problems have \['x', 'y'\]"):
-        constrained_fit(rows_of(*random_rows()), c)
 
 
 def test_covariance_follows_the_library_of_the_rows() -> None:

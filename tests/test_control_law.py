@@ -1,4 +1,3 @@
-import re
 from itertools import combinations
 
 import numpy as np
@@ -102,18 +101,8 @@ def test_a_term_that_one_point_alone_decides_is_out() -> None:
     assert law.functions.names == ("1",)  # with x the last point fits exactly, and says nothing
 
 
-@pytest.mark.parametrize(
-    ("values", "points", "settings", "message"),
-    [
-        (np.ones(2), POINTS[:2], {}, "a law needs three points or more"),
-        (np.ones(6), POINTS[:, :1], {}, "one column for each of ['V_D_V', 'mdot_mg_s'], got 1"),
-        (np.full(6, np.nan), POINTS, {}, "values and parameters must be finite"),
-        (np.ones(4), POINTS[1:5], {}, "'V_D_V' is 300 at all 4 operating points; leave it out"),
-        (np.ones(6), POINTS, {"max_terms": 0}, "max_terms must be a whole number, one or more"),
-    ],
-)
-def test_what_cannot_make_a_law_is_refused(
-    values: np.ndarray, points: np.ndarray, settings: dict[str, int], message: str
-) -> None:
-    with pytest.raises(ValueError, match=re.escape(message)):
-        fit_control_law(values, points, LIBRARY, **settings)
+def test_what_cannot_make_a_law_is_refused() -> None:
+    with pytest.raises(ValueError, match="a law needs three points or more"):
+        fit_control_law(np.ones(2), POINTS[:2], LIBRARY)
+    with pytest.raises(ValueError, match="'V_D_V' is 300 at all 4 operating points"):
+        fit_control_law(np.ones(4), POINTS[1:5], LIBRARY)

@@ -145,6 +145,7 @@ def test_learned_term_is_in_si_and_knows_the_inputs() -> None:
         found.learned(x[:, None])
 
 
+@pytest.mark.slow
 def test_callers_module_is_left_alone_and_seeding_decides_the_rest() -> None:
     given = network(2, 2)
     before = [p.detach().clone() for p in given.parameters()]

@@ -2,11 +2,13 @@
 
 import ast
 import doctest
+import inspect
 import re
 import shlex
 import sys
 import tomllib
 from collections.abc import Iterator
+from enum import Enum
 from importlib.util import find_spec
 from pathlib import Path
 from shutil import which
@@ -25,9 +27,6 @@ from ep2sindy.app.arguments import mend
 from ep2sindy.app.runner import study_class
 from ep2sindy.app.schema import study_of
 from ep2sindy.data.open import write_field
-from ep2sindy.model.comparison import Status
-from ep2sindy.report.results import View
-from ep2sindy.studies.candidates import RULES, candidate_metrics
 from tests.pages import (
     FENCE,
     PAGES,
@@ -267,26 +266,12 @@ def test_what_a_page_links_to_is_there() -> None:
     assert not lost, "\n".join(lost)
 
 
-@pytest.mark.parametrize(
-    ("came", "is_right"),
-    [
-        ("x' = 0.66 x - 1 (±0.0031) y\nend", True),  # rounded, half-width by less than a half
-        ("x' = 0.66 x - 1 (±0.0031) y\nmore\nend", True),  # `...` is any lines
-        ("x' = 0.5 x - 1 (±0.002) y\nend", False),  # another number
-        ("x' = 0.66 x - 1 (±0.002) z\nend", False),  # another term
-        ("x' = 0.66 x - 1 (±0.002) y", False),  # a line less
-    ],
-)
-def test_what_is_printed_is_compared(came: str, is_right: bool) -> None:
-    assert (not difference("x' = 0.665 x - 1 (±0.002) y\n...\nend", came)) == is_right
-
-
 def test_the_messages_that_the_faq_quotes_are_those_of_the_package() -> None:
     """`...` stands for what a message says of names and numbers."""
     quotes = re.findall(r'^### "(.*)"$', (ROOT / "docs" / "faq.md").read_text("utf-8"), re.M)
     assert len(quotes) > 15
-    stated = messages()
-    lost = [quote for quote in quotes if not any(is_of(quote, text) for text in stated)]
+    stated = "\0".join(messages())
+    lost = [quote for quote in quotes if not is_of(quote, stated)]
     assert not lost, "\n".join(lost)
 
 
@@ -305,7 +290,7 @@ def messages() -> list[str]:
 
 def is_of(quote: str, text: str) -> bool:
     pieces = [re.escape(piece.strip(" ")) for piece in quote.split("...")]
-    return re.search(".*".join(pieces), text) is not None
+    return re.search(r"[^\0]*".join(pieces), text) is not None
 
 
 def test_every_experiment_is_on_the_page_that_leads_to_one() -> None:
@@ -317,13 +302,6 @@ def test_every_experiment_is_on_the_page_that_leads_to_one() -> None:
     assert options
     for text in [*commands_given, *(f"{same} {option}" for option in options)]:
         check_command(shlex.split(text))
-
-
-def test_the_glossary_has_the_verdicts_and_the_columns_of_candidates() -> None:
-    words = (ROOT / "docs" / "glossary.md").read_text("utf-8").replace("\n  ", " ")
-    columns = [m.heading or m.key for m in candidate_metrics("d_pareto") if View.SCREEN in m.view]
-    for name in [*Status, *RULES, *columns]:
-        assert re.search(rf"\*{re.escape(name)}\*|\*\*[^*]*\b{re.escape(name)}\b", words), name
 
 
 def has_example(name: str) -> bool:
@@ -346,3 +324,25 @@ def test_the_example_of_a_docstring_runs(name: str, here: Path) -> None:
     stated: list[str] = []
     doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(example, out=stated.append)
     assert not stated, "".join(stated)
+
+
+@pytest.mark.slow
+def test_a_docstring_describes_every_parameter() -> None:
+    """In its section `Parameters`, in any order; exceptions and enumerations have none."""
+    lost = []
+    for name, entry in dotted_names().items():
+        value = entry.load()
+        if not callable(value) or (isinstance(value, type) and issubclass(value, NO_PARAMETERS)):
+            continue
+        section = re.search(
+            r"^Parameters\n-+\n(.*?)(?=^\w+\n-+\n|\Z)", inspect.getdoc(value), SECTION
+        )
+        heads = re.findall(r"^(\S.*?) : ", section[1], re.MULTILINE) if section else []
+        stated = {each.lstrip("*") for head in heads for each in head.split(", ")}
+        if missing := set(inspect.signature(value).parameters) - stated:
+            lost.append(f"{name}: {sorted(missing)}")
+    assert not lost, "\n".join(lost)
+
+
+SECTION = re.MULTILINE | re.DOTALL
+NO_PARAMETERS = (Exception, Enum)

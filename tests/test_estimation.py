@@ -6,7 +6,6 @@ import re
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +15,6 @@ import ep2sindy as ep
 from benchmarks.estimation import LORENZ, SHORT
 from benchmarks.known_systems import noisy
 from ep2sindy.data.sensor import Bounds
-from ep2sindy.discovery.method import method_of
 from ep2sindy.estimation import cost, explanation, kernels, likelihood
 from ep2sindy.estimation.kernels import filter_states, marginalise, smooth_corrections
 from ep2sindy.estimation.likelihood import (
@@ -31,7 +29,7 @@ from ep2sindy.estimation.likelihood import (
 from ep2sindy.estimation.noise import _shown_by_samples
 from ep2sindy.estimation.observation import LackOfFit, Solution
 from ep2sindy.estimation.problem import EstimationProblem, scale_problem
-from ep2sindy.estimation.solver import EXACT, from_smooth, smooth_states
+from ep2sindy.estimation.solver import EXACT, from_smooth
 from ep2sindy.estimation.supports import alternatives, best_support, penalise, term_penalties
 from ep2sindy.trust import memory
 from ep2sindy.trust.interruption import is_interruption
@@ -469,20 +467,6 @@ def test_a_switched_input_is_exact_and_its_multiples_are_no_terms() -> None:
     assert np.abs(found.model.coef).max() < 3.0
 
 
-def test_a_joint_discovery_has_fronts_scores_and_a_model() -> None:
-    system = ep.lorenz()
-    found = ep.discover(system.trajectory(noise=0.2, rng=0))
-    assert is_right(found.model, system)
-    assert found.estimate is not None
-    for state, front in found.fronts.items():
-        assert front.candidates[0].n_terms == 0
-        assert front.candidates[int(np.argmin(found.scores[state]))].terms == tuple(
-            found.chosen[state].terms
-        )
-        assert found.chosen[state].coef_by_term == found.model.terms(state)
-    assert found.note in repr(found)
-
-
 def test_the_search_is_the_same_in_other_units() -> None:
     system = ep.lotka_volterra()
     run = system.trajectory(noise=0.1, rng=0)
@@ -494,59 +478,12 @@ def test_the_search_is_the_same_in_other_units() -> None:
     np.testing.assert_allclose(other.coef, one.coef * factor, rtol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"selection": ep.EBIC()}, r"selection must be Evidence\(\)"),
-        ({"max_terms": 0}, "max_terms must be a whole number, one or more, got 0"),
-        ({"limit_s": 0.0}, "limit_s must be positive, in s, or None"),
-        ({"limit_s": np.nan}, "limit_s must be positive, in s, or None"),
-    ],
-)
-def test_settings_that_do_not_go_with_trajectories_are_refused(
-    settings: dict[str, Any], message: str
-) -> None:
-    with pytest.raises(ValueError, match=message):
-        ep.TrajectorySearch(**settings)
-
-
-RULE = ep.FreeRunScore(n_folds=2)
-RULED = ep.TrajectorySearch(selection=RULE, depth=2)
-
-
-def method_with(search: ep.TrajectorySearch, selection: object, depth: int) -> object:
-    return method_of(ep.WeightedWeak(), search, ep.Bootstraps(n=0), selection, depth)
-
-
-def test_settings_of_a_given_search_hold_and_none_is_given_twice() -> None:
-    deep = ep.TrajectorySearch(depth=3)
-    assert method_with(deep, ep.discovery.Evidence(), 1) == deep
-    assert method_with(ep.TrajectorySearch(), RULE, 2) == RULED
-    assert method_with(RULED, ep.discovery.Evidence(), 2) == RULED
-    with pytest.raises(ValueError, match=r"must be set once, got .*search.depth\), and 2 next to"):
-        method_with(deep, ep.discovery.Evidence(), 2)
-    with pytest.raises(ValueError, match="search.selection.*; leave one of them out"):
-        method_with(RULED, ep.FreeRunScore(n_folds=3), 1)
-
-
-def test_evidence_is_refused_for_fronts_of_rows() -> None:
+def test_what_cannot_be_estimated_is_refused() -> None:
     run = ep.lotka_volterra().trajectory(noise=0.05, rng=0)
-    with pytest.raises(ValueError, match="Evidence weighs what a search of trajectories found"):
-        ep.discover(
-            run, method=ep.Regression(search=ep.BestSubset(), selection=ep.discovery.Evidence())
-        )
-
-
-def test_what_cannot_be_estimated_is_refused_with_the_way_out() -> None:
-    run = ep.lotka_volterra().trajectory(noise=0.05, rng=0)
-    with pytest.raises(ValueError, match=r"the library needs \['z'\].*\+exp=trace"):
+    with pytest.raises(ValueError, match=r"the library needs \['z'\]"):
         ep.estimate([run], ep.polynomial(["x", "y", "z"], degree=1))
-    with pytest.raises(ValueError, match="limit_s must be positive"):
-        ep.estimate([run], ep.polynomial(["x", "y"], degree=2), limit_s=-1.0)
     with pytest.raises(ValueError, match="needs more samples than terms, got 6"):
         ep.estimate([run.window(0, 6)], ep.polynomial(["x", "y"], degree=2))
-    with pytest.raises(ValueError, match="a run must have five samples or more: .* has 2"):
-        ep.estimate([run, run.window(0, 2)], ep.polynomial(["x", "y"], degree=2))
 
 
 def test_a_library_without_the_constant_where_a_state_drifts_is_a_lack_of_fit() -> None:
@@ -619,21 +556,6 @@ def test_runs_are_joined_without_a_way_from_one_to_the_next(
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9 * np.abs(other).max())
 
 
-def test_a_pass_over_many_runs_is_a_single_call(
-    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    fit = three_runs(rng)
-    calls: list[int] = []
-
-    def tell(flow: np.ndarray, *rest: np.ndarray) -> tuple:
-        calls.append(len(flow))
-        return marginalise(flow, *rest)
-
-    monkeypatch.setattr(likelihood, "marginalise", tell)
-    gram(fit)
-    assert calls == [len(fit.path) - 1]
-
-
 def test_more_coefficients_than_memory_holds_are_refused_first(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -648,21 +570,16 @@ def test_more_coefficients_than_memory_holds_are_refused_first(
     cost.check_size([run], library, run_of_known_terms)
 
 
-def test_a_long_search_is_stated_of_with_its_time() -> None:
+def test_a_long_search_is_warned_of_unless_a_limit_ends_it_sooner() -> None:
     run, t = many_states(7), np.linspace(0.0, 900.0, 90_000)
     long = ep.Trajectory(t, np.tile(np.sin(t)[:, None], 7), run.state_names)
     large = ep.polynomial(run.state_names, degree=3)
-    stated = r"840 coefficients .*, of which 140 .* some 2 minutes of one core and 2.6 GB"
-    with pytest.warns(ep.discovery.SlowSearch, match=stated):
+    with pytest.warns(ep.discovery.SlowSearch, match="some 2 minutes of one core"):
         cost.check_size([long], large, {})
-    with pytest.warns(ep.discovery.SlowSearch, match="of which 840 .* some 60 minutes"):
-        cost.check_size([long], large, {}, coupled=True)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         cost.check_size([run], large, {})
         cost.check_size([long], large, {}, limit_s=200.0)
-    with pytest.warns(ep.discovery.SlowSearch, match="limit_s ends it"):
-        cost.check_size([long], large, {}, limit_s=20.0)
 
 
 class Clock:
@@ -694,36 +611,6 @@ def test_a_search_ends_at_its_limit_with_the_best_so_far(
     else:
         assert not found.lack_of_fit
         assert set(found.model.terms("x")) == {"x", "y"}
-
-
-def test_the_time_is_looked_at_within_a_step_of_a_fit() -> None:
-    """A step makes many passes over the samples, each of which may be long."""
-    now, steps = 0, 0
-
-    def clock() -> float:
-        return float(now)
-
-    def advance(n_more: int) -> None:
-        nonlocal steps
-        steps += n_more
-
-    run = ep.lorenz().trajectory(noise=0.05, rng=0).window(0, 100)
-    monitor = cost.SearchMonitor(limit_s=1.0, clock=clock, advance=advance)
-    problem = scale_problem([run], ep.polynomial(run.state_names, degree=2), monitor=monitor)
-    noise = np.full(run.states.shape, 0.1)
-    free, support = np.zeros(problem.n_free), np.ones(problem.n_free, dtype=bool)
-    fit = TrajectoryFit(problem, noise, 0.1, problem.records[0].samples, free, support)
-    now, monitor.best = 2, fit
-    for one_pass in (
-        lambda: fit.squares,
-        lambda: gram(fit),
-        lambda: smooth_states(problem, None),
-    ):
-        with pytest.raises(cost.OutOfTimeError, match="must end within limit_s=1 s"):
-            one_pass()
-    assert steps == 0
-    monitor.best = None  # a first model is waited for
-    assert np.isfinite(fit.squares).all()
 
 
 @pytest.mark.parametrize(
@@ -833,7 +720,7 @@ def test_process_noise_alone_is_no_law() -> None:
 def test_samples_that_leave_the_terms_open_are_reported_to_tell_nothing() -> None:
     found = ep.estimate(SHORT["60 samples, 20 %"](0), LORENZ.model.library)
     assert re.match(
-        r"60 samples do not tell these equations from others: the chance .* is \d+%",
+        r"60 samples do not tell these equations from others: the chance .* is \d+ %",
         found.too_few_samples,
     )
     assert found.note.startswith(found.too_few_samples)

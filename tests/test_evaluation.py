@@ -2,20 +2,17 @@
 
 import re
 from dataclasses import replace
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 
 from benchmarks.known_systems import noisy
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.forecasting import evaluation
-from ep2sindy.forecasting.evaluation import Evaluation, evaluate, size_text
+from ep2sindy.forecasting.evaluation import evaluate
 from ep2sindy.library.library import polynomial
-from ep2sindy.model.comparison import FreeRunBounds, Status, samples_in
+from ep2sindy.model.comparison import FreeRunBounds, Status
 from ep2sindy.model.model import SparseModel, coef_matrix
-from ep2sindy.studies.views import found_model, worst_run
+from ep2sindy.studies.views import worst_run
 from ep2sindy.systems.systems import lorenz, lotka_volterra
 from tests.models import model_of
 
@@ -127,13 +124,6 @@ def test_a_run_that_needs_ever_smaller_steps_stops() -> None:
     assert "its steps became too small for the samples" in rollout.message
 
 
-def test_samples_of_a_duration() -> None:
-    run = record()
-    assert samples_in(run, float(run.t[10])) == 11
-    with pytest.raises(ValueError, match="a window must hold two samples"):
-        samples_in(run, 1e-9)
-
-
 SLOW = pytest.mark.slow
 
 
@@ -168,21 +158,6 @@ def test_a_density_below_zero_is_a_verdict_of_its_own(radius, unit, verdict) -> 
     assert found.status is verdict
     if verdict is Status.NEGATIVE:
         assert found.text == "turns negative"
-
-
-def test_the_title_of_a_result_says_where_a_model_was_fitted_and_what_it_does_not_explain() -> None:
-    run = evaluate(hopf(), record())
-
-    def title(run: Evaluation, **how: Any) -> str:
-        return found_model("Found", run, file="a", picture="", where="it", **how).title
-
-    assert title(run) == "Found: a model that sustains the oscillation"
-    assert (
-        title(run, seen=True) == "Found: a model that sustains the oscillation where it was fitted"
-    )
-    similar = replace(run, status=Status.NO_CYCLE)
-    assert title(similar) == "Found: a model that has the means and amplitudes of the data"
-    assert title(similar, lack_of_fit="no law") == "Found: a model that does not explain the data"
 
 
 def test_of_several_records_the_worst_run_counts() -> None:
@@ -236,30 +211,6 @@ def test_a_run_without_a_cycle_has_none_of_its_numbers() -> None:
     assert re.fullmatch(r"diverges after [0-9.]+ s", diverges.text)
 
 
-def test_only_what_is_asked_for_is_computed_and_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    calls: list[str] = []
-    for name in ("limit_cycle", "basin_stability", "rest_point", "forecast_skill"):
-        plain = getattr(evaluation, name)
-
-        def stated(*args: Any, name: str = name, plain: Any = plain, **kwargs: Any) -> Any:
-            calls.append(name)
-            skill = SimpleNamespace(text=f"fitted to {kwargs.get('n_fitted')}")
-            return skill if name == "forecast_skill" else plain(*args, **kwargs)
-
-        monkeypatch.setattr(evaluation, name, stated)
-    found = evaluate(hopf(growth=0.05), record(), n_fitted=1000)
-    assert (found.status, found.record.n_samples) == (Status.SUSTAINED, 1002)
-    assert found.periods == pytest.approx(20.0, abs=0.1)
-    assert not calls
-    assert found.multiplier < 1.0
-    assert calls == ["limit_cycle"]
-    assert "fitted to 1000" in repr(found)
-    n_calls = len(calls)
-    assert repr(found)
-    assert len(calls) == n_calls
-    assert calls.count("forecast_skill") == calls.count("limit_cycle") == 1
-
-
 def test_of_a_line_of_rest_points_one_is_stated() -> None:
     run = record()
     beside = evaluate(model_of({"x": {"y": 1.0}, "y": {"y": -1.0}}), run, n_samples=200)
@@ -269,24 +220,7 @@ def test_of_a_line_of_rest_points_one_is_stated() -> None:
     assert far.rest_points == ()
 
 
-def test_a_run_that_left_is_not_stated_in_its_size() -> None:
-    assert [size_text(x) for x in (0.5, 100.0, 4.11e7)] == ["0.5", "100", "over 100"]
-
-
 def test_forecasts_need_held_out_samples() -> None:
     assert evaluate(hopf(), record()).forecast is None
     with pytest.raises(ValueError, match="got n_fitted=1999 for 2001 samples"):
         evaluate(hopf(), record(), n_fitted=1999)
-
-
-def test_the_table_fits_a_screen_and_tells_what_a_discovery_does_not_explain() -> None:
-    found = evaluate(SimpleNamespace(model=hopf(), lack_of_fit="x < its noise"), record())
-    assert found.lack_of_fit == "x < its noise"
-    lines = repr(found).splitlines()
-    assert lines[1].split() == ["status", "sustained"]
-    assert lines[-1].split(maxsplit=2)[2] == "fit      x < its noise"
-    assert len(lines) <= 25
-    assert max(map(len, lines)) <= 100
-    assert "x &lt; its noise" in found._repr_html_()
-    with pytest.raises(ValueError, match="model must be a SparseModel"):
-        evaluate("x", record())  # type: ignore[arg-type]

@@ -1,4 +1,3 @@
-import sys
 from pathlib import Path
 
 import pandas as pd
@@ -58,17 +57,6 @@ def test_the_thesis_stands_next_to_our_cells(toy_run: Path) -> None:
     assert len(pd.read_csv(toy_run / "tables" / "outcomes.csv")) == 8
 
 
-def test_terminal_and_page_show_both(toy_run: Path) -> None:
-    log = (toy_run / "run.log").read_text()
-    page = (toy_run / "report.html").read_text()
-    for name in ("benchmark", "attractors", "trajectories"):
-        assert f'id="figure-{name}"' in page
-    assert "Identified by ours" in page  # the last variant that makes models
-    assert log.count("ALASSO, thesis") == 3
-    italic = next(row for row in page.split("<tr ") if ">100/92</td>" in row)
-    assert italic.startswith('class="italic"><td>ALASSO, thesis</td>')
-
-
 def test_the_published_tables_are_those_of_the_thesis() -> None:
     table = published_cells().set_index(["variant", "system", "noise"])
     assert len(table) == 4 * 4 * 3
@@ -89,24 +77,3 @@ def test_every_definition_makes_a_variant() -> None:
     for name, definition in composed("definitions=pysindy").definitions.items():
         if name.startswith("PySINDy"):
             assert isinstance(instantiate(definition), Variant)
-
-
-@pytest.fixture
-def no_pysindy(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "pysindy", None)
-    monkeypatch.delitem(sys.modules, "benchmarks.pysindy_variants", raising=False)
-
-
-@pytest.mark.usefixtures("no_pysindy")
-def test_other_variants_run_without_pysindy(tmp_path: Path) -> None:
-    settings = ["systems=[oscillator]", "noises=[0]", "variants=[STLSQ]"]
-    folder = run_config(composed(*toy(tmp_path), *settings))
-    assert (folder / "summary.json").is_file()
-
-
-@pytest.mark.usefixtures("no_pysindy")
-def test_a_rival_without_pysindy_is_refused(tmp_path: Path) -> None:
-    config = composed(*toy(tmp_path), "definitions=pysindy", "variants=[ours,PySINDy_SSR]")
-    message = r"PySINDy is not there: pip install \"ep2sindy\[benchmark\]\""
-    with pytest.raises(ValueError, match=message):
-        run_config(config)

@@ -1,21 +1,15 @@
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hydra import compose, initialize_config_dir
 
-import ep2sindy as ep
 from ep2sindy.app.runner import run_config
 from ep2sindy.app.schema import study_of
 from ep2sindy.discovery.discover import discover
-from ep2sindy.discovery.result import NoiseTest
 from ep2sindy.library.library import polynomial
 from ep2sindy.model.model import SparseModel
-from ep2sindy.report.document import Text
 from ep2sindy.runtime.files import write_json
-from ep2sindy.studies.candidates import REPLACED, add_estimate
 from ep2sindy.studies.libraries import Study
 from tests.models import model_of
 from tests.programs import ROOT, Computed, composed, computed, on_file, summary_of
@@ -48,7 +42,7 @@ def plain(path: Path, output: Path) -> list[str]:
 def breathing_run(predator_prey: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The run folder of one breathing experiment on known data."""
     output = tmp_path_factory.mktemp("outputs")
-    return run_config(composed(*breathing(predator_prey, output)))
+    return computed(composed(*breathing(predator_prey, output))).folder
 
 
 def test_two_densities_alone_leave_out_what_needs_more_and_a_seed_fixes_what_is_found(
@@ -100,64 +94,16 @@ def test_breathing_ends_in_a_model_that_is_sustained(breathing_run: Path) -> Non
     assert len(terms) == 4
     assert all(each["without_status"] != "sustained" for each in terms.values())
     assert "balance_simple" not in found
-    for figure in ("free_run_simple", "cycle_simple", "waveform_simple"):
-        assert (breathing_run / "figures" / f"{figure}.png").is_file()
-    for table in ("sustained", "coefficients", "terms_simple", "rollout_simple_sustained"):
-        assert (breathing_run / "tables" / f"{table}.csv").is_file()
-
-
-def test_the_page_says_the_model_that_is_sustained_before_candidates(breathing_run: Path) -> None:
-    page = (breathing_run / "report.html").read_text()
-    found, rest = page[page.index('id="found"') :].split("</section>", 1)
-    assert "the cycle is neutral: it neither attracts nor repels" in found
-    assert 'id="figure-free_run_simple"' in found
-    order = [
-        "How the models run", "simple: the model that free runs select (sustained)",
-        "simple: terms as physical processes", "simple: forecasts over time held out",
-        "The selected models", "simple: candidate equations", "ionization: candidate equations",
-    ]  # fmt: skip
-    titles = re.findall(r"<h[23][^>]*>(.*?)</h", rest)
-    assert [title for title in titles if title in order] == order
 
 
 def test_a_run_folder_holds_all_that_it_takes_to_look_again(breathing_run: Path) -> None:
     folder = breathing_run
-    files = [
-        "config.yaml",
-        "provenance.json",
-        "tables/front_velocity.csv",
-        "tables/evaluations.csv",
-    ]
-    for name in [*files, "figures/data.png", "figures/trajectories.png"]:
+    files = ["config.yaml", "provenance.json", "report.html", "tables/front_velocity.csv"]
+    for name in [*files, "tables/evaluations.csv"]:
         assert (folder / name).is_file(), name
     assert list(folder.glob("tensorboard/events*"))
     model = SparseModel.load(folder / "models" / "simple.json")
     assert model.terms("n_i") == summary_of(folder)["models"]["simple"]["equations"]["n_i"]
-
-
-def test_a_page_says_what_was_asked_and_how_to_do_it_again(breathing_run: Path) -> None:
-    page = (breathing_run / "report.html").read_text()
-    assert "BestSubset (max_terms 4" in page
-    assert "max_terms: 4" in page  # the whole config
-    summary = summary_of(breathing_run)
-    frequency_Hz = summary["evaluations"]["simple"]["frequency_Hz"]["n_i"]
-    assert summary["headline"]["simple/f_kHz"] == 1e-3 * frequency_Hz
-
-
-def test_a_record_too_short_for_forecasts_is_searched_without(tmp_path: Path) -> None:
-    t = np.arange(21.0)
-    run = ep.Trajectory(t, np.column_stack([np.cos(0.5 * t), np.sin(0.5 * t)]), ["x", "y"])
-    run.to_dataframe().to_csv(tmp_path / "run.csv")
-    found = computed(
-        composed(
-            "+exp=discover", "data=recognised", f"data.path={tmp_path / 'run.csv'}",
-            "trajectory.states=[x,y]", "libraries.model.degree=1", f"output={tmp_path}",
-        )
-    )  # fmt: skip
-    assert set(found.report.models["model"].terms("x")) == {"y"}
-    assert "forecasts" not in found.summary
-    log = " ".join(found.log.split())
-    assert "no forecasts: they need 20 samples or more to fit and as many to test, and" in log
 
 
 @pytest.fixture(scope="module")
@@ -187,54 +133,19 @@ def test_a_record_in_years_reads_in_years_and_is_kept_in_seconds(years: Computed
     # The estimator's own standard error at this noise is about one per cent.
     assert found == pytest.approx({"hare": 0.6 / year, "hare*lynx": -0.03 / year}, rel=0.05)
     assert years.summary["data"]["dt_s"] == pytest.approx(year / 3.0)
-    assert "91 samples of 0.3333 years" in years.log
-    assert "Hz" not in years.log
     mine = re.search(r"hare' = (\S+) hare - (\S+) hare lynx  <- selected", years.log)
     assert mine is not None
     assert [float(number) for number in mine.groups()] == pytest.approx([0.6, 0.03], rel=0.05)
-    assert "year<sup>−1</sup>" in years.page
 
 
 def test_a_joint_search_says_what_the_samples_say(years: Computed) -> None:
-    assert years.summary["notes"]["model"] == ""  # the section on the samples says it
     (found,) = years.summary["samples_model"]
     data = years.report.tables["rollout_model"]
     # Of 91 samples, some of which the parameters take: 10 % is a standard error and a half.
     noise = [found["noise_std"][name] / data[f"{name}_data"].std() for name in ("hare", "lynx")]
     assert noise == pytest.approx([0.02, 0.02], rel=0.25)
-    assert (found["flow_error"], found["lack_of_fit"], found["too_few_samples"]) == (
-        0.0,
-        None,
-        None,
-    )
-    stated = " ".join(years.log.split())
-    assert "The model explains the samples to within their noise" in stated
-    assert "95 % from" in years.page
-
-
-def test_a_report_says_if_the_samples_speak_of_another_model(years: Computed) -> None:
-    assert REPLACED not in years.page
-    run = ep.lotka_volterra().trajectory(noise=0.02, rng=0).window(0, 200)
-    found = replace(ep.discover(run), noise_test=NoiseTest())
-    add_estimate(years.report, "other", found)
-    texts = [each.text for each in years.report.sections[-1].blocks if isinstance(each, Text)]
-    assert REPLACED in texts
-
-
-def test_a_rule_that_runs_models_says_how_it_decided(predator_prey: Path, tmp_path: Path) -> None:
-    found = computed(
-        composed(
-            "+exp=discover", *on_file(predator_prey, tmp_path),
-            "trajectory.states=[n_i,n_n]", "search=best_subset", "search.max_terms=2",
-            "selection=free_run", "selection.n_windows=6", "selection.n_folds=2", "depth=1",
-            "bootstraps.n=4", "forecasts=0",
-        )
-    )  # fmt: skip
-    note = found.summary["notes"]["model"]
-    log = " ".join(found.log.split())
-    assert note
-    assert log.count(note) == 1
-    assert "equations selected by free runs or refinements; run freely" in found.page
+    tests = ("flow_error", "lack_of_fit", "too_few_samples")
+    assert [found[name] for name in tests] == [0.0, None, None]
 
 
 @pytest.mark.parametrize(
@@ -274,45 +185,12 @@ def test_a_selection_on_the_command_line_is_every_librarys(rule: str, tmp_path: 
         assert type(case.method(study.method).selection) is type(study.method.selection)
 
 
-def test_the_weak_form_and_a_criterion_go_from_the_command_line_to_the_report(
-    predator_prey: Path, tmp_path: Path
-) -> None:
-    chosen = ["formulation=weak", "selection=ebic", "depth=2"]
-    left_out = ["~libraries.ionization", "~libraries.velocity"]
-    result = computed(composed(*plain(predator_prey, tmp_path), *chosen, *left_out))
-    found = result.summary["equations"]
-    assert found["simple/n_i"]["r2_test"] is None
-    front = result.report.tables["front_simple"]
-    for state, rows in front.groupby("equation"):
-        assert rows.loc[rows["selected"], "EBIC"].item() == rows["EBIC"].min()
-        assert found[f"simple/{state}"]["EBIC"] == pytest.approx(rows["EBIC"].min())
-        assert rows["n_terms"].value_counts().max() == 2
-    assert "weighted: n_i' = -1.64e+05 n_i" in result.log
-
-
-def test_a_library_may_have_a_knee_norm_of_its_own(breathing_run: Path) -> None:
-    log = (breathing_run / "run.log").read_text()
-    assert log.count("selection: Knee(n_norm='max_terms', scale='linear')") == 2
-
-
 def test_an_error_is_kept_in_the_log(predator_prey: Path, tmp_path: Path) -> None:
     config = composed(*breathing(predator_prey, tmp_path), "bootstraps.n_culled=6")
     with pytest.raises(ValueError, match="n_culled"):
         run_config(config)
     (folder,) = (tmp_path / "breathing").iterdir()
     assert "ended early: ValueError: n_culled must leave" in (folder / "run.log").read_text()
-
-
-def test_a_sweep_can_go_to_slurm() -> None:
-    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        config = compose(
-            "config",
-            overrides=["+exp=parametric", "hydra/launcher=slurm"],
-            return_hydra_config=True,
-        )
-    launcher = config.hydra.launcher
-    assert launcher._target_.endswith("SlurmLauncher")
-    assert (launcher.cpus_per_task, launcher.tasks_per_node) == (8, 1)
 
 
 def test_a_state_that_shows_nothing_but_noise_has_no_law(tmp_path: Path) -> None:
@@ -325,7 +203,4 @@ def test_a_state_that_shows_nothing_but_noise_has_no_law(tmp_path: Path) -> None
             "data.units={time: s}", "trajectory.states=[x]", f"output={tmp_path}",
         )
     )  # fmt: skip
-    stated = " ".join(found.log.split())
-    assert "Found with the library model: no law of any state" in stated
-    assert "no law of x is found: about a steady course the samples pass for white noise" in stated
-    assert "run freely from one sample over the record" not in stated
+    assert "Found with the library model: no law of any state" in " ".join(found.log.split())

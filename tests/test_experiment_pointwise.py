@@ -2,7 +2,6 @@ import os
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 import xarray as xr
 from omegaconf import DictConfig, OmegaConf
@@ -16,8 +15,6 @@ from ep2sindy.studies.resume import pieces_key
 from tests import programs
 from tests.programs import summary_of
 from tests.test_resume import broken_and_resumed
-
-ROOT = Path(__file__).resolve().parents[1]
 
 
 def composed(*overrides: str) -> DictConfig:
@@ -74,14 +71,9 @@ def test_the_file_holds_every_map(toy_run: Path) -> None:
         assert ((result["confidence"] >= 0) & (result["confidence"] <= 1)).all()
 
 
-def test_tables_figures_and_page_are_there(toy_run: Path) -> None:
+def test_points_and_figures_go_to_tensorboard(toy_run: Path) -> None:
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-    terms = pd.read_csv(toy_run / "tables" / "terms.csv")
-    assert len(terms) == 2 * len(TERMS)
-    assert terms["selected"].between(0, 1).all()
-    for name in ("coefficients", "regimes", "quality"):
-        assert (toy_run / "figures" / f"{name}.png").stat().st_size > 5e3
     events = EventAccumulator(str(toy_run / "tensorboard")).Reload()
     assert [e.value for e in events.Scalars("points/done")][-1] == 30.0
     assert {"coefficients", "regimes", "quality"} <= set(events.Tags()["images"])
@@ -94,9 +86,6 @@ def test_a_line_of_points_without_an_optional_variable(grid: Path, tmp_path: Pat
     overrides = ["data.r.name=null", "data.variables.u_ir.name=null"]
     found = programs.computed(composed(*on_file(line, tmp_path), *overrides))
     assert found.summary["n_points"] == 6
-    log = " ".join(found.log.split())
-    assert "lacks their variables: n_i*u_ir" in log
-    assert "(all 6 points)" in log
     found.check_figures("regimes")
     with xr.open_dataset(found.folder / "pointwise.nc") as result:
         assert list(result["term"].values) == [name for name in TERMS if "u_ir" not in name]
@@ -130,23 +119,6 @@ def test_own_code_that_has_changed_has_other_blocks(place: str, grid: Path, here
         source.write_text(f"def half(field):\n    return field / {divisor}\n")
         keys += [key_of(*as_step), key_of(*as_study)]
     assert len(set(keys)) == 4
-
-
-def test_a_study_that_selects_nothing_is_a_result(tmp_path: Path) -> None:
-    rng = np.random.default_rng(0)
-    time_s, z = 1.5e-6 * np.arange(400), np.array([0.01, 0.02, 0.03])
-    noise = {
-        name: (("time", "z"), 1.0 + 0.1 * rng.standard_normal((400, 3)), {"units": unit})
-        for name, unit in (("n_i", "m^-3"), ("n_n", "m^-3"), ("u_iz", "m/s"), ("R_ion", "m^3/s"))
-    }
-    path = tmp_path / "noise.nc"
-    write_field(xr.Dataset(noise, coords={"time": time_s, "z": z}), path)
-    overrides = [*on_file(path, tmp_path), "data.r.name=null", "data.variables.u_ir.name=null"]
-    found = programs.computed(composed(*overrides, "terms=[n_i*u_iz]", "selection=ebic"))
-    assert found.summary["n_valid"] == 3
-    assert found.summary["equations"] == [{"n_i": {}, "n_n": {}}]
-    assert set(found.report.figures) == {"regimes", "quality"}
-    found.check_figures("regimes", "quality")
 
 
 def test_other_settings_have_other_blocks(grid: Path, tmp_path: Path) -> None:

@@ -7,8 +7,7 @@ import pytest
 from omegaconf import DictConfig
 
 import ep2sindy as ep
-from ep2sindy.app.runner import run_config
-from tests.programs import composed, computed, summary_of
+from tests.programs import composed, computed
 
 # A growth rate that damps towards a cycle, as those found in the discharge current do.
 CYCLE = {"1": 7.93e9, "I": -2.44e9, "I*g": 1.07e4, "g^3": -1.47e-6}
@@ -59,8 +58,7 @@ def test_hidden_states_that_do_not_fit_are_shown_if_asked_for(tmp_path: Path) ->
 
 
 def test_one_column_of_a_file_becomes_a_sustained_model(record: Path, tmp_path: Path) -> None:
-    folder = run_config(composed(*toy(record, tmp_path, "tried=[{how: rate}]")))
-    summary = summary_of(folder)
+    summary = computed(composed(*toy(record, tmp_path, "tried=[{how: rate}]"))).summary
     run = summary["evaluations"]["trace"]
     assert run["status"] == "sustained"
     assert abs(run["f_error"]) < 0.005
@@ -71,43 +69,26 @@ def test_one_column_of_a_file_becomes_a_sustained_model(record: Path, tmp_path: 
     assert summary["signal"]["how"] == "rate"
     assert summary["signal"]["known"] == {"I": "I*g"}
     assert summary["data"]["units"] == {"I": "A", "g": "s^-1"}
-    log = (folder / "run.log").read_text()
-    assert "known: I' = I g" in " ".join(log.split())
-    assert "intervals are not given" in " ".join(log.split())  # of smoothed states
     assert summary["signal"]["lack_of_fit"]
     forecast = summary["forecasts"]["trace"]
     assert {"model", "harmonics", "autoregression", "neighbours"} <= set(forecast["nrmse"])
-    assert "Found from I: a model that forecasts within half a standard deviation" in log
-    assert f"and more, {forecast['text']}" in " ".join(log.split())
-    assert "run freely from one sample over its end" in log
-    assert "unstable: a perturbation grows" in " ".join(log.split())
     assert max(forecast["nrmse"]["model"]) < 0.3
     (tried,) = summary["tried"]
     assert tried["n_states"] == 2
     assert tried["error"] < 0.3
-    for name in ("free_run", "cycle", "waveform", "front", "forecast"):
-        assert (folder / "figures" / f"{name}_trace.png").exists()
 
 
-@pytest.mark.parametrize("how", ["derivative", "delays"])
-def test_a_signal_of_either_sign_can_be_taken(how: str, tmp_path: Path) -> None:
+def test_a_signal_of_either_sign_can_be_taken(tmp_path: Path) -> None:
     t = 0.12 * np.arange(850)  # 16 periods
     run = ep.systems.van_der_pol(mu=0.5).model.simulate(t, [2.0, 0.0])
     path = scope(tmp_path / "scope.csv", run.t, run.states[:, 0])
-    settings = {
-        "derivative": toy(path, tmp_path, "search.max_terms=3", "tried=[{how: derivative}]"),
-        "delays": glance(path, tmp_path, "tried=[{how: delays, degree: 1}]"),
-    }
-    found = computed(composed(*settings[how]))
+    given = toy(path, tmp_path, "search.max_terms=3", "tried=[{how: derivative}]")
+    found = computed(composed(*given))
     assert found.summary["signal"]["reason"] == "set"
-    if how == "derivative":
-        equations = found.summary["models"]["trace"]["equations"]
-        assert equations["I"] == {"v": 1.0}
-        assert set(equations["v"]) == {"I", "v", "I^2*v"}
-        assert found.summary["evaluations"]["trace"]["status"] == "sustained"
-    else:
-        assert found.summary["signal"]["known"] == {}
-        assert "I_before" in found.log
+    equations = found.summary["models"]["trace"]["equations"]
+    assert equations["I"] == {"v": 1.0}
+    assert set(equations["v"]) == {"I", "v", "I^2*v"}
+    assert found.summary["evaluations"]["trace"]["status"] == "sustained"
 
 
 def test_a_signal_that_does_not_repeat_itself_is_tried_in_three_states(tmp_path: Path) -> None:
@@ -139,7 +120,6 @@ def test_a_short_record_is_assessed_on_all_of_it(tmp_path: Path) -> None:
     found = computed(composed(*glance(path, tmp_path, "held_out=0.2")))
     assert found.summary["signal"]["n_fitted"] == found.summary["data"]["n_samples"]
     assert "forecasts" not in found.summary
-    assert "too short to hold out" in " ".join(found.log.split())
 
 
 @pytest.mark.parametrize(
@@ -148,7 +128,6 @@ def test_a_short_record_is_assessed_on_all_of_it(tmp_path: Path) -> None:
         (lambda t, x: (t[:200], x[:200]), [], "must hold 6 periods or more"),
         (lambda t, x: (t, np.random.default_rng(0).random(len(t))), [], "must oscillate"),
         (lambda t, x: (t, x - 1.0), ["tried=[{how: rate}]"], "needs a positive signal: I falls"),
-        (lambda t, x: (t, x), ["tried=[{how: lags}]"], "how must be auto, hidden"),
     ],
 )
 def test_what_cannot_be_taken_is_refused(change, more, message, tmp_path: Path) -> None:
@@ -175,12 +154,6 @@ def test_a_recognised_signal_without_a_unit_takes_the_one_given(tmp_path: Path) 
     assert found.report.tables["states"]["I"].mean() == pytest.approx(1e-3 * mean, rel=1e-2)
 
 
-def test_a_unit_that_the_data_contradict_is_refused(tmp_path: Path) -> None:
-    config = recognised(tmp_path / "scope.csv", "time [s],I_d [A]", "signal=I_d", "unit=mA")
-    with pytest.raises(ValueError, match="I_d comes in 'A', got unit=mA; leave unit out"):
-        computed(config)
-
-
 @pytest.mark.slow
 def test_a_mean_that_was_lost_is_asked_for_and_given_back(tmp_path: Path) -> None:
     t, x = signal(12.0)
@@ -194,8 +167,7 @@ def test_a_mean_that_was_lost_is_asked_for_and_given_back(tmp_path: Path) -> Non
 
 
 def test_one_column_of_a_file_becomes_the_law_with_intervals(record: Path, tmp_path: Path) -> None:
-    trace = computed(composed(*toy(record, tmp_path)))
-    found = trace.summary
+    found = computed(composed(*toy(record, tmp_path))).summary
     assert found["signal"]["how"] == "hidden"
     model = found["models"]["trace"]
     assert not found["signal"]["lack_of_fit"]
@@ -204,8 +176,6 @@ def test_one_column_of_a_file_becomes_the_law_with_intervals(record: Path, tmp_p
     for term, (low, high) in model["intervals"]["g"].items():
         assert low < CYCLE[term] < high
     assert found["evaluations"]["trace"]["status"] == "sustained"
-    assert "explain the signal to its noise" in " ".join(trace.log.split())
-    assert "smoothing" not in trace.log
 
 
 def test_a_mean_that_was_lost_is_fitted_with_its_interval(tmp_path: Path) -> None:
@@ -224,20 +194,5 @@ def test_a_mean_that_was_lost_is_fitted_with_its_interval(tmp_path: Path) -> Non
 def test_an_offset_that_no_equations_tell_is_refused(tmp_path: Path) -> None:
     t = np.linspace(0.0, 50.0, 501)
     path = scope(tmp_path / "scope.csv", t, np.sin(t) ** 3)
-    with pytest.raises(ValueError, match=r"offset=fit asks for equations .* write offset=NUMBER"):
+    with pytest.raises(ValueError, match="offset=fit asks for equations"):
         computed(composed(*toy(path, tmp_path, "offset=fit", "tried=[{how: hidden, degree: 1}]")))
-    with pytest.raises(ValueError, match="offset must be a number or fit, got 'fitted'"):
-        computed(composed(*toy(path, tmp_path, "offset=fitted")))
-
-
-def test_discover_says_that_one_state_cannot_oscillate(record: Path, tmp_path: Path) -> None:
-    config = composed(
-        "+exp=discover", "data=file", f"data.path={record}", "data.z.name=null",
-        "data.variables.n_i.name=null", "data.variables.n_n.name=null",
-        "+data.variables.I.name=I", "+data.variables.I.unit=A", "trajectory.states=[I]",
-        "search=best_subset", f"output={tmp_path}", "bootstraps.n=4",
-        "forecasts=0",
-    )  # fmt: skip
-    log = computed(config).log.replace("\n", " ")
-    assert "one first-order equation cannot" in log
-    assert "+exp=trace signal=I" in log

@@ -110,19 +110,12 @@ def test_a_field_over_a_grid_is_no_run_and_the_error_says_what_makes_one() -> No
         trajectories_of(field)
 
 
-def test_a_dataset_without_times_is_refused() -> None:
-    field = xr.Dataset({"x": ("time", np.arange(5.0) ** 2)})
-    with pytest.raises(ValueError, match="needs a coordinate time, in s or another unit"):
-        trajectories_of(field)
-
-
-def test_a_rollout_is_a_table_and_prints_in_a_screen() -> None:
+def test_a_rollout_is_a_table() -> None:
     model = ep.lotka_volterra().model
     run = model.simulate(np.linspace(0.0, 20.0, 500), [1.0, 1.0])
     table, data = run.to_dataframe(), run.to_xarray()
     np.testing.assert_array_equal(table[["x", "y"]].to_numpy(), run.states)
     np.testing.assert_array_equal(data["x"], run.states[:, 0])
-    assert repr(run).startswith("Rollout: 500 samples over 20 s, ran to the end")
 
 
 def test_a_library_has_degree_two_unless_another_is_asked_for() -> None:

@@ -6,9 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
-from ep2sindy.library.equations import equation_html
 from ep2sindy.report.folder import RunFolder
 from ep2sindy.runtime.files import WriteError, fingerprint, replacing, write_json, write_text
 
@@ -98,31 +96,6 @@ def test_json_has_null_for_what_is_not_a_number(tmp_path: Path) -> None:
     assert content == {"a": [1.0, None], "b": {"c": None}}
 
 
-def test_figures_are_written_in_the_formats_that_are_asked_for(tmp_path: Path) -> None:
-    folder = RunFolder.create(tmp_path, "x", now=NOW)
-    figure = Figure()
-    figure.subplots().plot(np.arange(3))
-    png = folder.write_figure("line", figure, ["pdf", "png"])
-    assert png.startswith(b"\x89PNG")
-    assert (folder.path / "figures" / "line.png").read_bytes() == png
-    assert (folder.path / "figures" / "line.pdf").read_bytes().startswith(b"%PDF")
-    folder.write_figure("alone", figure, ["png"])
-    assert not (folder.path / "figures" / "alone.pdf").exists()
-
-
-def test_a_written_figure_keeps_its_layout(tmp_path: Path) -> None:
-    figure = Figure(layout="constrained")
-    axes = figure.subplots(1, 2)
-    axes[0].set_ylabel("a label that takes room")
-    before = axes[0].get_position().bounds
-    RunFolder.create(tmp_path, "x", now=NOW).write_figure("line", figure)
-    solved = axes[0].get_position().bounds
-    assert solved != before
-    axes[0].set_ylabel("another\nthat takes\nmore")
-    figure.draw_without_rendering()
-    assert axes[0].get_position().bounds == solved
-
-
 def test_provenance_names_commit_and_versions(tmp_path: Path) -> None:
     folder = RunFolder.create(tmp_path, "x", now=NOW)
     folder.write_provenance(seed=3, command=["run", "+exp=x"])
@@ -130,12 +103,3 @@ def test_provenance_names_commit_and_versions(tmp_path: Path) -> None:
     assert content["seed"] == 3
     assert content["commit"]
     assert content["versions"]["numpy"] == np.__version__
-
-
-def test_equations_read_in_html() -> None:
-    html = equation_html("n_i", {"n_i": -2.62e5, "n_i^2*<n_i*R>": 4e-14, "1": 1e-3})
-    assert html == (
-        "d<i>n</i><sub>i</sub>/dt = &minus; 2.62&times;10<sup>5</sup> <i>n</i><sub>i</sub> "
-        "+ 4&times;10<sup>&minus;14</sup> <i>n</i><sub>i</sub><sup>2</sup> "
-        "&lang;<i>n</i><sub>i</sub> <i>R</i>&rang; + 0.001"
-    )

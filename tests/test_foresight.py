@@ -70,19 +70,3 @@ def test_what_is_stated_holds_in_the_library_of_every_preparation_that_has_it() 
     assert set(library.facts.excluded["v"]) == {"x^2", "1", "cos(x)"}
     assert set(library.facts.excluded) == {"v"}
     assert len(library.facts.relations) == len(states.relations) + 1
-
-
-@pytest.mark.parametrize(
-    ("stated", "how", "words"),
-    [
-        (StatedFacts(exclude={"y": ["x"]}), "auto", "must name states that are tried"),
-        (StatedFacts(rests_at_zero=True), "hidden", "leave it out"),
-    ],
-)
-def test_facts_that_no_preparation_can_keep_are_refused(
-    stated: StatedFacts, how: str, words: str
-) -> None:
-    signal = trace_of(np.sin(np.arange(600) / 6.0))
-    with pytest.raises(ValueError, match=words):
-        stated.check([Preparation(how)], signal)
-    StatedFacts(exclude={"v": ["x"]}, rests_at_zero=True).check([Preparation("auto")], signal)

@@ -153,18 +153,6 @@ def test_units_change_nothing(found):
         np.testing.assert_allclose(again.scores[state], found.scores[state], rtol=1e-4)
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"window_periods": 0.0}, "window_periods must be positive, got 0.0"),
-        ({"margin": 1.5}, "margin must lie between 0 and 1, got 1.5"),
-    ],
-)
-def test_settings_are_checked(settings, message):
-    with pytest.raises(ValueError, match=message):
-        ep.FreeRunScore(**settings)
-
-
 def test_folds_share_no_sample_and_leave_none_out():
     run = record(8.0)
     for runs in ([run], [run] * 5):

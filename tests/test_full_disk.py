@@ -9,8 +9,6 @@ from pathlib import Path
 
 import pytest
 
-from ep2sindy.report.screen import Screen
-from ep2sindy.report.tensorboard import Board
 from ep2sindy.runtime.files import LEFT_AFTER_S, WriteError, replacing, sweep
 
 resource = pytest.importorskip("resource", reason="limits of a process need POSIX")
@@ -55,19 +53,6 @@ def test_an_error_of_a_worker_arrives_whole() -> None:
     arrived = pickle.loads(pickle.dumps(sent))
     assert isinstance(arrived, WriteError)
     assert (str(arrived), arrived.reason) == (str(sent), "No space left on device")
-
-
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is always full")
-def test_a_log_that_cannot_be_written_is_named() -> None:
-    screen = Screen(Path("/dev/full"))
-    with pytest.raises(WriteError, match=r"/dev/full could not be written \(No space left"):
-        screen.print("a line")
-
-
-def test_a_board_that_cannot_be_written_is_named(tmp_path: Path) -> None:
-    (tmp_path / "taken").write_text("a file")
-    with pytest.raises(WriteError, match="taken/board could not be written"):
-        Board(tmp_path / "taken" / "board").scalars({"x": 1.0}, step=0)
 
 
 def test_only_what_killed_processes_left_is_swept(tmp_path: Path) -> None:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import math
 import pickle
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -15,7 +13,7 @@ import torch
 import ep2sindy as ep
 from ep2sindy.data.coerce import keep_inside, noise_inside
 from ep2sindy.library import functions as registry
-from ep2sindy.library.equations import equation_html, equation_text, latex_term_name, sum_sympy
+from ep2sindy.library.equations import equation_text, latex_term_name, sum_sympy
 from ep2sindy.library.library import Library, named_terms, polynomial
 from ep2sindy.model.solve import edges_of
 from ep2sindy.refinement.refine import refine
@@ -72,22 +70,12 @@ def test_names_are_read_in_any_way_and_written_in_one(written: str, name: str) -
     [
         ("sine(x)", r"unknown function 'sine' in 'sine\(x\)'; there are \['sin', 'cos'.*register"),
         ("sin(q)", r"unknown variable 'q' in term 'sin\(q\)'"),
-        ("sin(0*x)", r"must be of its variable: 'sin\(0\*x\)' multiplies it by 0"),
         *((bad, "a term is variables joined by") for bad in ("sin(x*v)", "sin()", "1/sin(x)")),
     ],
 )
 def test_bad_functions_are_refused_by_name(name: str, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         named_terms(["x", "v"], [name])
-
-
-def test_values_are_those_of_the_formula_in_numpy_and_torch() -> None:
-    x, v = points().T
-    expected = [np.sin(2 * x), np.cos(x), np.exp(-0.5 * x), np.log(1 + x), np.sqrt(x), np.abs(v)]
-    expected += [1 / x, v / (0.5 + x) ** 2, x * np.sin(2 * x) * v**2, x**0]
-    np.testing.assert_allclose(every().evaluate(points()).T, expected, rtol=1e-14)
-    together = every().evaluate(torch.from_numpy(points())).numpy()
-    np.testing.assert_allclose(together.T, expected, rtol=1e-14)
 
 
 def test_derivatives_are_those_of_differences_and_of_autograd(tanh: str) -> None:
@@ -134,31 +122,6 @@ def test_a_library_takes_functions_of_every_variable_or_of_one() -> None:
     assert named.names[-1] == "sin(x)*v"
 
 
-@pytest.mark.parametrize(
-    ("setting", "message"),
-    [
-        ({"functions": ["sine"]}, r"functions must be some of \['sin', .*, got 'sine'"),
-        ({"functions": "sin"}, r"functions must be a list, got 'sin'; write \['sin'\]"),
-        ({"functions": ["x*sin(v)"]}, "go into products"),
-        ({"functions": ["sin(x)^2"]}, "come with function_degree=2"),
-        ({"function_degree": 2}, r"function_degree=2 needs functions, such as \['sin'\]"),
-    ],
-)
-def test_wrong_functions_of_a_library_are_refused(setting: dict, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        polynomial(["x", "v"], degree=1, **setting)
-
-
-def test_polynomials_are_the_same_library_as_ever() -> None:
-    """No column, no call and no copy more than without functions."""
-    library = polynomial(["x", "v"], degree=3)
-    columns = np.ones((7, 3))
-    assert library.functions == ()
-    assert library.with_functions(columns, axis=1) is columns
-    assert keep_inside(library, columns, columns) is columns
-    assert library.exponents.shape == (10, 2)
-
-
 def test_a_share_of_the_terms_keeps_only_the_functions_it_needs() -> None:
     some = every().take(np.array([1, 7]))
     assert [f.name for f in some.functions] == ["cos(x)", "1/(0.5+x)"]
@@ -170,17 +133,9 @@ def test_equations_are_written_in_every_language() -> None:
     assert equation_text("x", terms) == "x' = 1 x - 2 x sin(2 v)/(0.5+n_i)^2 + 3/x"
     latex = r"\frac{x \, \sin(2 \, v)}{(0.5+n_{i})^{2}}"
     assert latex_term_name("x*sin(2*v)/(0.5+n_i)^2") == latex
-    assert latex_term_name("sqrt(x)*abs(v)*tanh(x)") == r"\sqrt{x} \, |v| \, \mathrm{tanh}(x)"
-    assert "sin(2 <i>v</i>) / (0.5+<i>n</i><sub>i</sub>)<sup>2</sup>" in equation_html("x", terms)
     sympy = pytest.importorskip("sympy")
-    x, v, n = sympy.symbols("x v n_i")
-    expected = 1.0 * x - 2.0 * x * sympy.sin(2 * v) / (n + 0.5) ** 2 + 3.0 / x
-    assert sympy.simplify(sum_sympy(terms) - expected) == 0
-    values = {x: 0.7, v: -0.3, n: 1.9}
     (own,) = sum_sympy({"tanh(x)": 1.0}).atoms(sympy.Function)
-    assert (str(own), own == sympy.tanh(x)) == ("tanh(x)", False)  # what it means is the user's
-    number = 0.7 - 2 * 0.7 * np.sin(-0.6) / 2.4**2 + 3 / 0.7
-    assert float(sum_sympy(terms).subs(values)) == pytest.approx(number, rel=1e-12)
+    assert (str(own), own == sympy.tanh(sympy.Symbol("x"))) == ("tanh(x)", False)  # the user's
 
 
 def test_relations_name_terms_with_functions() -> None:
@@ -190,14 +145,6 @@ def test_relations_name_terms_with_functions() -> None:
     coef = dict(zip(held.coefficients, held.coef(np.array([7.0, 3.0])), strict=True))
     assert coef[("x", "1/x")] == -2 * coef[("v", "1/x")]
     assert coef[("x", "sin(2*x)*v")] == 1.5
-
-
-def test_greek_names_are_written_as_letters() -> None:
-    model = ep.pendulum().model
-    assert r"\dot{\theta} &= w " in model.latex()
-    assert r"- 9.81 \, \sin(\theta)" in model.latex()
-    assert latex_term_name("omega_c*x") == r"\omega_{c} \, x"
-    assert "sin(<i>&theta;</i>)" in equation_html("w", {"sin(theta)": 1.0})
 
 
 # A user's own function
@@ -225,10 +172,14 @@ def _square(x: np.ndarray) -> np.ndarray:
     return x * x
 
 
+def _double(x: np.ndarray) -> np.ndarray:
+    return 2.0 * x
+
+
 def test_a_function_of_ones_own_travels_with_its_derivative(
     kinds: dict[str, registry.Kind],
 ) -> None:
-    ep.register_function("own_square", _square)
+    ep.register_function("own_square", _square, _double)
     sent = pickle.dumps(named_terms(["x"], ["own_square(x)", "sin(x)"]))
     del kinds["own_square"]
     library = pickle.loads(sent)  # as in a worker, where nobody registered it
@@ -237,54 +188,19 @@ def test_a_function_of_ones_own_travels_with_its_derivative(
     assert named_terms(["x"], ["own_square(2*x)"]).evaluate(np.array([[3.0]]))[0, 0] == 36.0
 
 
-def _hill(x: np.ndarray) -> np.ndarray:
-    return x**2 / (0.25 + np.square(x))
-
-
-FORMULAS = {
-    "tanh": (np.tanh, lambda x: 1.0 - np.tanh(x) ** 2),
-    "hill": (_hill, lambda x: 0.5 * x / (0.25 + x**2) ** 2),
-    "drag": (lambda x: x * np.abs(x), lambda x: 2.0 * np.abs(x)),
-    "line": (lambda x: 3.0 - 2.0 * x, lambda x: np.full(x.shape, -2.0)),
-    "bell": (lambda x: np.exp(-(x**2) / 2.0), lambda x: -x * np.exp(-(x**2) / 2.0)),
-}
-
-
-@pytest.mark.parametrize("name", FORMULAS)
-def test_the_derivative_of_a_formula_is_found_by_itself(
-    name: str, kinds: dict[str, registry.Kind]
-) -> None:
-    value, slope = FORMULAS[name]
-    ep.register_function(f"own_{name}", value)
-    found, x = kinds[f"own_{name}"], np.linspace(-1.4, 1.5, 60).reshape(3, 20)
-    assert found.slope(x) == pytest.approx(slope(x), rel=1e-12, abs=1e-15)
-    assert found.slope(x).shape == x.shape
-
-
-@pytest.mark.parametrize("value", [lambda x: np.where(x > 0.0, x, 0.0), np.arctanh, np.sum])
-def test_what_is_no_formula_needs_a_derivative(value: Callable[..., object]) -> None:
-    message = r"derivative is found by itself for a formula of .*'odd' is none.*'odd', value, deri"
-    with pytest.raises(ValueError, match=message):
-        ep.register_function("odd", value, domain=(-0.9, 0.9))
-
-
 @pytest.mark.parametrize(
-    ("name", "value", "slope", "domain", "message"),
+    ("name", "value", "slope", "message"),
     [
-        ("sin", np.sin, np.cos, None, "'sin' is built in: give your function another name"),
-        ("a b", np.sin, np.cos, None, "must be a plain word, such as 'tanh', got 'a b'"),
-        ("wrong", np.sin, np.sin, None, "derivative of 'wrong' must be that of its value: at"),
-        ("root", np.sqrt, lambda x: 0.5 / np.sqrt(x), None, "value of 'root' must give a finite"),
-        ("of_one", math.tanh, np.cos, None, "must take and return NumPy arrays: .* not math.tanh"),
-        ("sums", np.sum, np.cos, None, "value of 'sums' must give a finite number for each"),
+        ("sin", np.sin, np.cos, "'sin' is built in: give your function another name"),
+        ("wrong", np.sin, np.sin, "derivative of 'wrong' must be that of its value: at"),
+        ("sums", np.sum, np.cos, "value of 'sums' must give a finite number for each"),
     ],
 )
 def test_functions_that_cannot_be_are_refused(
-    name: str, value: object, slope: object, domain: object, message: str
+    name: str, value: object, slope: object, message: str
 ) -> None:
-    setting = {} if domain is None else {"domain": domain}
     with pytest.raises(ValueError, match=message):
-        ep.register_function(name, value, slope, **setting)
+        ep.register_function(name, value, slope)
     assert name == "sin" or name not in registry._kinds
 
 
@@ -307,20 +223,6 @@ def test_a_sample_outside_a_domain_is_named(method: ep.Regression | ep.Trajector
     message = r"log\(x\) needs x > 0: x\[412\] = -0.03 at t = 4.12 s of 'probe'; name functions"
     with pytest.raises(ValueError, match=message):
         ep.discover(signal(x, "probe"), library, method)
-
-
-@pytest.mark.parametrize(
-    ("function", "x", "message"),
-    [
-        ("1/x", np.cos(T), r"1/x needs x to stay on one side of 0: x\[0\] = 1 .*\(187 such"),
-        ("log(1-2*x)", 0.6 - 0.3 * np.cos(T), r"needs 1-2\*x > 0: x\[124\] .*\(377 such samples\)"),
-        ("exp(x)", 800.0 + T, r"exp\(x\) needs x < 709: x\[0\] = 800"),
-    ],
-)
-def test_every_domain_has_its_words(function: str, x: np.ndarray, message: str) -> None:
-    library = polynomial(["x", "v"], degree=1, functions=[function])
-    with pytest.raises(ValueError, match=message):
-        ep.discover(signal(x), library)
 
 
 def test_each_run_may_stay_on_a_side_of_its_own_of_a_pole() -> None:
@@ -402,9 +304,6 @@ def test_a_run_that_leaves_a_domain_ends_there_and_says_so(
 def test_a_run_may_start_outside_a_domain_or_be_driven_out_of_it() -> None:
     fall = model_of({"x": {"log(x)": 1.0}}).simulate(T, [-1.0])
     assert (fall.diverged, fall.outside, len(fall.t)) == (True, "log(x)", 1)
-    assert (
-        "the start, at t = 0 s, is outside the domain of log(x), which needs x > 0" in fall.message
-    )
     driven = model_of({"x": {"log(u)": 1.0}}, ("u",))
     run = driven.simulate(T, [-1.0], {"u": lambda t: 2.0 - t})
     assert run.outside == "log(u)"
@@ -440,13 +339,6 @@ def test_terms_that_a_model_does_not_have_need_no_domain() -> None:
     assert model.score(run.trajectory(), x_dot=-run.states) == 1.0
     nothing = ep.SparseModel(library, ["x"], np.zeros((3, 1)))
     np.testing.assert_array_equal(nothing.predict(below), 0 * below)
-
-
-def test_a_score_names_samples_that_the_model_is_not_defined_at() -> None:
-    model = model_of({"x": {"log(x)": 1.0}, "v": {"x": 1.0}})
-    with pytest.raises(ValueError, match=r"log\(x\) needs x > 0: x\[158\] = -0.009"):
-        model.score(signal(np.cos(T)))
-    assert np.isnan(model.predict(np.array([-1.0, 0.0]))[0])
 
 
 # Searches

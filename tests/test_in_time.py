@@ -7,7 +7,6 @@ import pytest
 import xarray as xr
 
 import ep2sindy as ep
-from ep2sindy.data.gaps import describe_breaks, present_rows
 
 T = np.sort(np.random.default_rng(2).uniform(0.0, 1.0, 400))
 T[[0, -1]] = 0.0, 1.0
@@ -83,17 +82,6 @@ def test_gaps_too_long_or_at_an_end_are_refused() -> None:
         ep.data.interpolate(gappy().isel(time=slice(3, None)))
 
 
-def test_a_delay_is_the_signals_past() -> None:
-    t = np.linspace(0.0, 1.0, 101)
-    field = ep.data.delay(field_of(t, x=np.sin(3 * t)), variable="x", delay_s=0.105)
-    later = field["time"].values
-    assert later[0] == pytest.approx(0.11)
-    # straight lines over 0.01 s: x'' h^2 / 8
-    np.testing.assert_allclose(field["x_delayed"].values, np.sin(3 * (later - 0.105)), atol=1.2e-4)
-    np.testing.assert_array_equal(field["x"].values, np.sin(3 * t)[11:])
-    assert field["x_delayed"].attrs["units"] == "A"
-
-
 def test_derivatives_at_unequal_steps_are_exact_for_parabolas() -> None:
     field = ep.data.derivative(plane(T), variable="I_d")
     np.testing.assert_allclose(field["dI_d_dt"].values, 2 * T, atol=1e-9)
@@ -116,11 +104,6 @@ def test_detrending_takes_a_polynomial_out_and_keeps_the_mean(degree: int) -> No
     [
         (ep.data.resample, {"dt_s": 2.0},
          "leave two samples or more, got 2 s for a record of 1 s"),
-        (ep.data.delay, {"variable": "q", "delay_s": 0.1},
-         r"unknown variable .*'q'; .*\['x', 'I_d'\]"),
-        (ep.data.delay, {"variable": "x", "delay_s": -0.1}, "delay_s must be positive"),
-        (ep.data.delay, {"variable": "x", "delay_s": 0.1, "name": "I_d"},
-         "a new name: the field already has 'I_d'"),
         (ep.data.detrend, {"degree": 0}, "degree must be 1 or more, .*, got 0"),
     ],
 )  # fmt: skip
@@ -129,16 +112,9 @@ def test_steps_say_what_they_cannot_do(step: object, settings: dict, message: st
         step(plane(T), **settings)
 
 
-def test_a_step_takes_a_field_and_no_trajectory() -> None:
-    run = ep.lotka_volterra().trajectory()
-    with pytest.raises(ValueError, match=r"must be an xarray\.Dataset, .*, got Trajectory"):
-        ep.data.crop(run, start_s=5.0)
-
-
 def test_steps_that_need_every_sample_name_a_gap() -> None:
     for step, settings in (
         (ep.data.resample, {"dt_s": 0.5}),
-        (ep.data.delay, {"variable": "x", "delay_s": 1.0}),
         (ep.data.derivative, {"variable": "x"}),
         (ep.data.detrend, {}),
     ):
@@ -160,18 +136,3 @@ def test_a_state_without_a_number_is_named() -> None:
     field["x"].values[:] = np.nan
     with pytest.raises(ValueError, match="x must hold numbers: all its 11 samples are NaN"):
         ep.zone_average(field, None, states=["x", "y"])
-
-
-def test_samples_that_no_row_holds_together_are_named() -> None:
-    t = np.arange(6.0)
-    x, y = np.where(t < 3, t, np.nan), np.where(t >= 2, t, np.nan)
-    with pytest.raises(ValueError, match="of 6 samples x lacks 3, y lacks 2, and 1 are left"):
-        present_rows({"x": x, "y": y})
-
-
-def test_gaps_in_the_times_themselves_are_counted() -> None:
-    t = 1e-6 * np.array([*range(20), *range(60, 80), *range(200, 220)])
-    assert describe_breaks(t).startswith(
-        "the record has 2 gaps: 0.000121 s pass after sample 40, at 7.9e-05 s, where steps"
-    )
-    assert not describe_breaks(t[:20])

@@ -1,25 +1,20 @@
 """Files without a mapping: what they are taken for, what is asked, and what is made of it."""
 
 import json
-import shlex
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pandas as pd
 import pytest
-import xarray as xr
 from scipy.io import savemat
 
 import ep2sindy as ep
-from ep2sindy.app import inspection
-from ep2sindy.app.inspection import experiments
 from ep2sindy.data.fields import clock_of
-from ep2sindy.data.quantities import axis_of, axis_unit, conversion, quantity_of, split_unit
+from ep2sindy.data.quantities import axis_of, axis_unit, conversion, quantity_of
 from ep2sindy.data.readers.registry import open_source
 from ep2sindy.data.recognition import recognise
 from ep2sindy.data.runs import trajectories_of
-from tests.programs import composed, computed
 
 NT, NZ, NR = 40, 7, 5
 T = np.arange(NT) * 1.5e-6
@@ -91,11 +86,6 @@ def test_axes_go_by_their_names(name: str, axis: str | None, unit: str) -> None:
         assert axis_unit(axis, name, "") == unit
 
 
-def test_the_case_of_a_unit_counts() -> None:
-    assert split_unit("c_mM") == ("c_mM", "")
-    assert split_unit("x_mm") == ("x", "mm")
-
-
 def odd_hdf5(path: Path, *, units: bool) -> None:
     """Odd names, axes reversed, no time; densities in cm^-3, temperatures in K."""
     with h5py.File(path, "w") as file:
@@ -123,30 +113,12 @@ def test_an_odd_file_that_names_its_units_opens_with_its_step_alone(tmp_path: Pa
     assert field["n_i"].dims == ("time", "z", "r")
 
 
-def test_an_inspection_says_what_is_there_and_what_lacks(tmp_path: Path) -> None:
-    odd_hdf5(tmp_path / "a.h5", units=True)
-    found = ep.inspect_file(tmp_path / "a.h5")
-    text = repr(found)
-    for part in (
-        "out/ionDens", "(5, 7, 40)", "n_i in cm-3", "give the step between samples, data.dt_s=STEP",
-        "R_ion is made by ep2sindy.thruster.ionization_rate from T_e_eV", "z in cm, 0.5 apart",
-        "no length of the channel",
-    ):  # fmt: skip
-        assert part in text, part
-    assert found.lacking(["n_i", "R_ion", "V_d"]) == ("V_d",)  # R_ion can be made
-    (ready,) = experiments(found)
-    assert "all but what is asked is there for +exp=breathing" in ready
-    assert "<table>" in ep.inspect_file(tmp_path / "a.h5")._repr_html_()
-
-
 def test_without_units_short_names_stay_and_what_is_plasma_is_offered(tmp_path: Path) -> None:
     odd_hdf5(tmp_path / "a.h5", units=False)
     found = ep.inspect_file(tmp_path / "a.h5")
     units = {name: variable.unit for name, variable in found.variables.items()}
     assert units == {"n_i": "m^-3", "n_n": "m^-3", "u_iz": "m/s", "Te": "1"}
     assert found.lacking(["T_e_eV"])
-    stated = "data.plasma=true takes 'out/Te' for T_e_eV, and what has no unit for SI"
-    assert stated in found.notes()
     assert "T_e_eV" in ep.inspect_file(tmp_path / "a.h5", plasma=True).variables
 
 
@@ -192,25 +164,6 @@ def test_columns_of_one_array_are_signals_of_their_own(tmp_path: Path) -> None:
         time=ep.data.Variable("t_s", "s"),
     )
     np.testing.assert_allclose(one["I_d"].values, 1e-3 * WAVE[:, 1, 0])
-
-
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("probe[:, 2]", r"must lie inside its array: 'probe' has shape \(40, 2\), counted from 0"),
-        ("probe[:, a]", "has no variable 'probe"),
-        ("prob", r"has no variable 'prob' .* \(did you mean 'probe'\?\)"),
-        ("probe[0:2, 1]", r"written like \[:, 1\]"),
-    ],
-)
-def test_parts_that_are_not_there_are_refused(tmp_path: Path, name: str, message: str) -> None:
-    savemat(tmp_path / "a.mat", {"probe": WAVE[:, :2, 0], "t": T})
-    with pytest.raises(ValueError, match=message):
-        ep.open_field(
-            tmp_path / "a.mat",
-            variables={"I_d": ep.data.Variable(name, "A")},
-            time=ep.data.Variable("t", "s"),
-        )
 
 
 @pytest.mark.parametrize(("name", "value"), [("fs", 1 / 1.5e-6), ("dt", 1.5e-6)])
@@ -282,24 +235,14 @@ def test_plain_columns_in_json_are_a_record(tmp_path: Path) -> None:
 
 def test_all_that_is_wrong_with_a_mapping_is_stated_at_once(tmp_path: Path) -> None:
     np.savez(tmp_path / "a.npz", t=T, z=Z, ni=N_I[:, :, 0], Te=T_E[:10, :, 0])
-    with pytest.raises(ValueError, match="4 things must be put right") as caught:
+    wrong = {"n_i": ("nii", "m^-3"), "u_iz": ("ni", "kg"), "T_e_eV": ("Te", "eV")}
+    with pytest.raises(ValueError, match="3 things must be put right"):
         ep.open_field(
             tmp_path / "a.npz",
-            variables={
-                "n_i": ep.data.Variable("nii", "m^-3"),
-                "n_n": ep.data.Variable("nn", "m^-3"),
-                "u_iz": ep.data.Variable("ni", "kg"),
-                "T_e_eV": ep.data.Variable("Te", "eV"),
-            },
+            variables={name: ep.data.Variable(*theirs) for name, theirs in wrong.items()},
             time=ep.data.Variable("t", "s"),
             z=ep.data.Variable("z", "m"),
         )
-    text = str(caught.value)
-    for part in (
-        "no variable 'nii' (wanted as n_i) (did you mean 'ni'?)", "no variable 'nn'", "got 'kg'",
-        "T_e_eV must fit the grid: the file has shape (10, 7)", "ni (40, 7)",
-    ):  # fmt: skip
-        assert part in text, part
 
 
 def test_temperatures_in_kelvin_become_those_in_eV() -> None:
@@ -326,57 +269,33 @@ def test_only_what_varies_along_time_is_offered_as_a_signal(tmp_path: Path) -> N
 
 
 def test_time_that_does_not_increase_is_named(tmp_path: Path) -> None:
-    back, twice = tmp_path / "back.csv", np.r_[np.arange(20.0), 19.0, np.arange(20.0, 40.0)]
+    back, rounded = tmp_path / "back.csv", tmp_path / "rounded.csv"
     back.write_text("time,x\n0,1\n1,2\n2,0\n1.5,3\n2.5,1\n")
-    with pytest.raises(ValueError, match=r"\(1.5 follows 2 at row 4; 0 repeat .*, 1 run"):
+    with pytest.raises(ValueError, match="1.5 follows 2 at row 4"):
         ep.open_field(back)
-    with pytest.raises(ValueError, match=r"19 follows 19 at row 21; 1 repeat"):  # no rounding
-        ep.open_field(write_csv(tmp_path / "twice.csv", t_s=twice, x=np.sin(twice)))
-    rounded = tmp_path / "rounded.csv"
     rounded.write_text("time,x\n99.9,1\n100,2\n100,0\n100,3\n101,1\n")
-    with pytest.raises(ValueError, match=r"\(100 follows 100 at row 3; 2 repeat .*give dt_s"):
+    with pytest.raises(ValueError, match="100 follows 100 at row 3; 2 repeat"):
         ep.open_field(rounded)
     assert list(ep.open_field(rounded, dt_s=0.1)["x"].values) == [1, 2, 0, 3, 1]
 
 
-@pytest.mark.parametrize(
-    ("files", "stated"),
-    [
-        (["a.csv", "b.csv", "notes.md"], r"take its 2 files that end in .csv, '.*runs/\*.csv'"),
-        ([], "is a folder, with no files in it"),
-    ],
-)
-def test_a_folder_says_the_way(tmp_path: Path, files: list[str], stated: str) -> None:
-    (tmp_path / "runs").mkdir()
-    for name in files:
-        (tmp_path / "runs" / name).write_text("t,x\n0,1\n")
-    with pytest.raises(ValueError, match=stated):
-        ep.inspect_file(tmp_path / "runs")
-
-
-def test_times_rounded_to_few_digits_are_equal_steps_and_reported(tmp_path: Path) -> None:
+def test_times_rounded_to_few_digits_are_equal_steps(tmp_path: Path) -> None:
     t = 99.0 + 0.35 * np.arange(NT)
     path = tmp_path / "a.csv"
     rows = [f"{a:.2E},{b:.4f}" for a, b in zip(t, WAVE[:, 0, 0], strict=True)]
     path.write_text("time (ms),x\n" + "\n".join(rows))
-    assert "were rounded to 3 digits, so that some repeat" in " ".join(
-        ep.inspect_file(path).notes()
-    )
     steps = np.diff(ep.open_field(path)["time"].values)
     np.testing.assert_allclose(steps, 0.35e-3, rtol=0.05)
     assert np.ptp(steps) < 1e-12
 
 
 @pytest.mark.parametrize("mark", [9.91e37, 9.9e37, 1e30, -999.0, -9999.0, 32767.0])
-def test_marks_of_overload_that_repeat_are_missing_samples_and_reported(
-    tmp_path: Path, mark: float
-) -> None:
+def test_marks_of_overload_that_repeat_are_missing_samples(tmp_path: Path, mark: float) -> None:
     x = WAVE[:, 0, 0].copy()
     x[[3, 9]] = mark
     path = write_csv(tmp_path / "a.csv", t_s=T, x=x)
     found = ep.inspect_file(path)
     assert found.held[1].n_missing == 2
-    assert "'x': 2 samples are marks of an overload or of absence, and left out" in found.notes()
     assert np.isnan(ep.open_field(path)["x"].values[[3, 9]]).all()
     (run,) = trajectories_of(pd.read_csv(path))
     assert run.n_samples == NT - 2
@@ -408,35 +327,3 @@ def test_what_counts_samples_is_no_time(tmp_path: Path, first: int) -> None:
 def test_one_bad_column_does_not_take_the_rest(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("t_s,x,y\n0,1,2\n1,0,1\n2,2,oops\n3,5,1\n")
     assert list(ep.open_field(tmp_path / "a.csv").data_vars) == ["x"]
-    assert "row 3 holds 'oops'" in " ".join(ep.inspect_file(tmp_path / "a.csv").notes())
-
-
-def test_a_capital_t_is_a_name_like_any_other(tmp_path: Path) -> None:
-    path = write_csv(tmp_path / "a.csv", t_s=T, T=WAVE[:, 0, 0])
-    assert list(ep.open_field(path).data_vars) == ["T"]
-
-
-def test_the_density_of_electrons_is_offered_as_that_of_ions(tmp_path: Path) -> None:
-    path = write_csv(tmp_path / "a.csv", t_s=T, n_e=N_I[:, 0, 0], n_n=N_N[:, 0, 0])
-    assert "in a quasi-neutral plasma 'n_e' is n_i: say so in" in " ".join(
-        ep.inspect_file(path).notes()
-    )
-
-
-def test_a_field_over_x_and_y_names_the_command_that_takes_a_point(
-    here: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    t = 1e-6 * np.arange(300)
-    waves = {"a": np.sin(1e5 * t), "b": np.cos(1e5 * t)}
-    data = {
-        name: (("time", "x", "y"), wave[:, None, None] * np.ones((4, 5)), {"units": "V"})
-        for name, wave in waves.items()
-    }
-    axes = {"time": ("time", t, {"units": "s"}), "x": np.arange(4.0), "y": np.arange(5.0)}
-    xr.Dataset(data, coords=axes).to_netcdf("xy.nc")
-    inspection.main(["xy.nc"], here)
-    shown = capsys.readouterr().out.splitlines()
-    (line,) = (each for each in shown if each.startswith("  ep2sindy +exp=discover"))
-    found = computed(composed(*shlex.split(line)[1:], "forecasts=0", "output=out"))
-    terms = found.summary["models"]["model"]["equations"]["a"]
-    assert terms == pytest.approx({"b": 1e5}, rel=1e-3)

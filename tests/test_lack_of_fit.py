@@ -246,13 +246,3 @@ def test_a_delay_is_stated_with_its_error() -> None:
     stated = re.search(r"y lags by \S+ s \((\S+) ± (\S+) samples\)", found.lack_of_fit)
     assert stated is not None
     assert abs(float(stated[1]) - 2.0) < 2.0 * float(stated[2])
-
-
-@pytest.mark.slow
-def test_samples_that_one_degree_more_explains_name_the_next_command() -> None:
-    """Coarse samples of the Brusselator: false terms and a little process noise follow them."""
-    run = chemical(0, n=120)
-    found = ep.discover(run)
-    assert "ep.polynomial(['x', 'y'], degree=3)" in found.lack_of_fit
-    assert "libraries.model.degree=3" in found.lack_of_fit
-    assert found.model.covariance is None

@@ -119,14 +119,10 @@ def test_points_left_out_live_by_laws_under_relations(how: str) -> None:
     assert [each.run.status for each in found] == [Status.SUSTAINED] * 9
 
 
-def test_a_file_and_the_text_hold_the_relations() -> None:
+def test_a_file_holds_the_relations() -> None:
     again = ep.operating.OperatingLaw.from_json(law("trajectories").to_json())
     np.testing.assert_array_equal(again.coef, law("trajectories").coef)
     assert again.provenance["exact"] == "; ".join(EXACT)
-    lines = law("trajectories").text().splitlines()
-    assert lines[0] == "x: x = 0.7 + 0.2 a^2"
-    assert tuple(lines[4:-1]) == tuple(f"exact: {text}" for text in EXACT)
-    assert lines[-1].startswith("points left out one at a time: the rates err by")
     check_exact(again.at(**BETWEEN), BETWEEN["a"])
 
 
@@ -143,9 +139,7 @@ def test_without_known_values_relations_are_the_same_everywhere() -> None:
     [
         (["x: y == -1 * y: y"], {}, "'y' is not in the support of 'y'"),
         (["x: x == 1"], KNOWN, r"relation 'x: x == 0.7 \+ 0.2 \* a\^2' contradicts"),
-        ([], {"x": {"x": {"c": 1.0}}}, r"x: x must be a sum of functions of \['a', 'b'\]"),
         (["x: x == 1", "x: x^3 == -1", "y: x == 1", "x: y == -1"], {}, "a law needs a free"),
-        ([], {"x": {"x": {"b": 1.0}}}, r"must be finite and not zero.* \[0.0\] at .*'b': 0"),
     ],
 )
 def test_relations_that_cannot_hold_are_refused(

@@ -166,19 +166,28 @@ def test_every_subpackages_is_on_the_list() -> None:
 
 
 def test_files_and_functions_stay_short() -> None:
+    """An explanation makes neither long: docstrings do not count."""
     long: list[str] = []
     for module, path in PATHS.items():
-        n_lines = len(path.read_text(encoding="utf-8").splitlines())
+        nodes = [
+            node
+            for node in ast.walk(tree(path))
+            if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef)
+        ]
+        n_lines = len(path.read_text(encoding="utf-8").splitlines()) - sum(map(n_stated, nodes))
         if n_lines > 500:
             long.append(f"{module} holds {n_lines} lines, over 500")
-        for node in ast.walk(tree(path)):
+        for node in nodes:
             if isinstance(node, ast.FunctionDef):
-                # An explanation makes no function long.
-                stated = len((ast.get_docstring(node) or "").splitlines())
-                n_lines = (node.end_lineno or node.lineno) - node.lineno + 1 - stated
+                n_lines = (node.end_lineno or node.lineno) - node.lineno + 1 - n_stated(node)
                 if n_lines > 50:
                     long.append(f"{module}.{node.name} takes {n_lines} lines, over 50")
     assert not long, "\n".join(long)
+
+
+def n_stated(node: ast.Module | ast.ClassDef | ast.FunctionDef) -> int:
+    """Lines of a docstring."""
+    return len((ast.get_docstring(node) or "").splitlines())
 
 
 def test_a_class_name_stands_once() -> None:

@@ -5,7 +5,6 @@ import pytest
 
 import ep2sindy as ep
 from benchmarks.many_states import cases, record, starts
-from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 
 PREY = ep.lotka_volterra()
 
@@ -43,16 +42,6 @@ def test_models_that_miss_hidden_states_follow_what_they_can(lacking) -> None:
         assert found.status not in ("non_finite", "flat")
 
 
-def test_a_failure_says_where(lacking) -> None:
-    models, run = lacking
-    method = MultipleShooting(first_memory=1000, max_iter=1)
-    settings = ep.refinement.RefinementSettings(n_windows=5, method=method, n_reweights=0)
-    found = ep.refine(models[1], [run], settings, periods=8.0, seed=0)
-    assert found.status in ("non_finite", "flat", "max_iter")
-    assert "the longest memory without gaps was 1 of " in found.message
-    assert " of trajectory 0, " in found.message
-
-
 def test_every_model_of_a_list_keeps_its_own_constraint() -> None:
     run, truth = PREY.trajectory(), PREY.model
     model = ep.SparseModel(truth.library, truth.states, 1.1 * truth.coef)
@@ -70,5 +59,3 @@ def test_every_model_of_a_list_keeps_its_own_constraint() -> None:
     np.testing.assert_allclose(together[0].model.coef, alone.model.coef, rtol=1e-8)
     with pytest.raises(ValueError, match=r"one entry per model.* 2 for 3 models$"):
         ep.refine([model] * 3, [[run]] * 3, constraints=known, seed=0)
-    with pytest.raises(ValueError, match="next to a common one; leave out one$"):
-        ep.refine([model] * 2, [[run]] * 2, constraint=known[0], constraints=known, seed=0)

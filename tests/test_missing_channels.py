@@ -83,7 +83,6 @@ def test_complete_samples_and_windows_keep_what_is_missing() -> None:
 @pytest.mark.parametrize(
     ("missing", "message"),
     [
-        (np.zeros((5, 1), dtype=bool), r"got bool of shape \(5, 1\) with states of shape \("),
         (np.tile([True, False], (5, 1)), r"every state needs samples: all of \['x'\] are missing"),
     ],
 )
@@ -93,24 +92,9 @@ def test_masks_that_mean_nothing_are_refused(missing: np.ndarray, message: str) 
         ep.Trajectory(np.arange(5.0), states, ["x", "y"], missing=missing)
 
 
-def test_nan_needs_a_mask_and_says_so() -> None:
-    states = np.arange(10.0).reshape(5, 2)
-    states[2, 0] = np.nan
-    with pytest.raises(ValueError, match=r"not measured \(missing=np.isnan\(states\)\)"):
-        ep.Trajectory(np.arange(5.0), states, ["x", "y"])
-
-
-def test_a_regression_needs_two_complete_samples() -> None:
-    missing = np.array([[True, False], [False, True]] * 4)
-    run = ep.Trajectory(np.arange(8.0), np.arange(16.0).reshape(8, 2) ** 1.5, ["x", "y"],
-                        missing=missing)  # fmt: skip
-    with pytest.raises(ValueError, match="x lacks 4, y lacks 4, and 0 of 8 hold all"):
-        ep.discover(run, ep.polynomial(["x", "y"], degree=1), ep.Regression())
-
-
 def test_an_equation_that_is_closed_holds_next_to_one_that_is_not() -> None:
     """Lorenz without z: x' = 10 (y - x) needs no z, and y' does."""
-    run = LORENZ.trajectory(noise=0.05, rng=0).window(0, 1500)
+    run = LORENZ.trajectory(noise=0.05, rng=0).window(0, 900)
     two = ep.Trajectory(run.t, run.states[:, :2], ["x", "y"])
     found = ep.estimate(two, ep.polynomial(["x", "y"], degree=2))
     assert found.explained_states == ("x",)

@@ -46,15 +46,6 @@ def test_an_empty_equation_prints_as_zero() -> None:
     assert model.sympy()["x"] == 0
 
 
-def test_latex_has_powers_of_ten_and_subscripts() -> None:
-    latex = breathing().latex()
-    assert (
-        r"\dot{n}_{i} &= - 2.62 \cdot 10^{5} \, n_{i} + 5.48 \cdot 10^{-14} \, n_{i} \, n_{n}"
-        in latex
-    )
-    assert r"- 0.77 \, n_{i} \, n_{n} \, R_{ion}" in latex
-
-
 def test_derivative_finds_its_variables_in_any_order() -> None:
     library = ep.named_terms(["u", "y", "x"], ["u*x", "y"])
     model = ep.SparseModel(library, ["x", "y"], np.array([[1.0, 0.0], [0.0, 3.0]]))
@@ -63,31 +54,11 @@ def test_derivative_finds_its_variables_in_any_order() -> None:
     assert slope.tolist() == [[14.0, 15.0]]
 
 
-def test_json_round_trip_is_exact(tmp_path: Path) -> None:
-    rng = np.random.default_rng(0)
-    library = ep.polynomial(VARIABLES, degree=2)
-    coef = rng.normal(size=(10, 2)) * 10.0 ** rng.integers(-40, 40, size=(10, 2))
-    coef[rng.random(size=coef.shape) < 0.5] = 0.0
-    model = ep.SparseModel(library, ["n_i", "n_n"], coef, UNITS, {"seed": "0"})
+def test_a_file_is_written_whole_and_read_back(tmp_path: Path) -> None:
+    model = breathing()
     model.save(tmp_path / "models" / "simple.json")
-    back = ep.SparseModel.load(tmp_path / "models" / "simple.json")
-    assert np.array_equal(back.coef, model.coef)
-    assert back.library.names == model.library.names
-    assert (back.states, dict(back.units), dict(back.provenance)) == (
-        model.states,
-        dict(model.units),
-        dict(model.provenance),
-    )
-    assert back.to_json() == model.to_json()
+    assert ep.SparseModel.load(tmp_path / "models" / "simple.json") == model
     assert [p.name for p in (tmp_path / "models").iterdir()] == ["simple.json"]
-
-
-def test_rollout_of_a_driven_model_matches_its_solution() -> None:
-    model, run = driven()
-    rollout = model.rollout(run)
-    assert not rollout.diverged
-    # The cubic spline of the input is the largest error: dt^4 * |u''''| * 5/384.
-    assert np.abs(rollout.states - run.states).max() < 5 / 384 * 0.025**4 * 10
 
 
 def test_rollout_of_a_window_starts_from_the_data() -> None:
@@ -118,21 +89,10 @@ def test_a_blow_up_is_reported_and_cut() -> None:
     assert np.isfinite(rollout.states).all()
 
 
-def test_missing_inputs_are_named() -> None:
-    model, run = driven()
-    bare = ep.Trajectory(t=run.t, states=run.states, state_names=["x"])
-    with pytest.raises(ValueError, match="unknown variable 'u'"):
-        model.rollout(bare)
-
-
 def test_bad_coefficients_are_refused() -> None:
     library = ep.polynomial(["x"], degree=1)
     with pytest.raises(ValueError, match="one row per term and one column per equation"):
         ep.SparseModel(library, ["x"], np.zeros((3, 1)))
-    with pytest.raises(ValueError, match="coefficients must be finite"):
-        ep.SparseModel(library, ["x"], np.full((2, 1), np.nan))
-    with pytest.raises(ValueError, match=r"unknown state 'y'; this model has \['x'\]"):
-        ep.SparseModel(library, ["x"], np.zeros((2, 1))).terms("y")
 
 
 def test_intervals_come_from_the_covariance_of_their_own_equation() -> None:
@@ -143,11 +103,6 @@ def test_intervals_come_from_the_covariance_of_their_own_equation() -> None:
     assert (low, high) == pytest.approx((-0.77 - 0.0195996, -0.77 + 0.0195996), rel=1e-6)
     low, high = model.intervals("n_i", level=0.6826894921)["n_i"]
     assert (low, high) == pytest.approx((-2.63e5, -2.61e5), rel=1e-9)
-
-
-def test_a_model_without_covariance_has_no_intervals() -> None:
-    with pytest.raises(ValueError, match="intervals need a covariance: this model has none"):
-        breathing().intervals("n_i")
 
 
 def test_equal_models_compare_equal_and_hash_alike() -> None:

@@ -1,5 +1,3 @@
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -95,11 +93,6 @@ def test_steps_are_of_order_four(step: Step) -> None:
     assert np.log2(errors[0] / errors[1]) == pytest.approx(5.0, abs=0.2)
 
 
-def test_input_beyond_its_last_sample_is_refused() -> None:
-    with pytest.raises(ValueError, match="inputs must cover the window: t = 1.5 was asked of 1"):
-        constant_drive(1.0, 2).at(1.5)
-
-
 def test_cubic_inputs_drive_torchdiffeq_exactly() -> None:
     """x' = u with u a cubic: rk4 integrates it exactly, over two segments."""
     library = ep.named_terms(["x", "u"], ["u"])
@@ -129,9 +122,6 @@ def test_correction_adds_to_the_rate() -> None:
 
 def test_bad_models_are_refused() -> None:
     model = ep.lotka_volterra().model
-    empty = replace(model, coef=np.zeros_like(model.coef))
-    with pytest.raises(ValueError, match="at least one term"):
-        ScaledEquations.of(empty, scale=SCALE, step_s=0.1)
     narrow = ep.library.constraint(model.library, {"x": ("x",), "y": ("y", "x*y")})
     with pytest.raises(ValueError, match=r"must cover every term .*\('x', 'x\*y'\)"):
         ScaledEquations.of(model, scale=SCALE, step_s=0.1, constraint=narrow)

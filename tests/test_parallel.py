@@ -2,24 +2,19 @@ import os
 import signal
 import subprocess
 import sys
-import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import nullcontext
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import psutil
 import pytest
 from threadpoolctl import threadpool_info
 
 from ep2sindy.runtime import parallel
-from ep2sindy.runtime.parallel import Dask, Loky, Serial, Workers, collect, rows_in_order, run_alike
+from ep2sindy.runtime.parallel import Loky, Serial, Workers, collect, rows_in_order, run_alike
 from ep2sindy.runtime.progress import as_progress
-from tests.models import lienard
-from tests.programs import composed, computed
 
 PATIENCE_S = 300.0  # for what comes at once on an idle machine: only what hangs is longer
 PIECES = [np.arange(k, dtype=np.float64) for k in range(7)]
@@ -27,10 +22,6 @@ PIECES = [np.arange(k, dtype=np.float64) for k in range(7)]
 
 def total(values: np.ndarray) -> float:
     return float(values.sum())
-
-
-def scaled_total(values: np.ndarray, *, factor: float) -> float:
-    return factor * total(values)
 
 
 def n_threads(_: object) -> int:
@@ -57,31 +48,8 @@ def fails_on_three(piece: int) -> int:
     return piece
 
 
-def dies_once(marker: str) -> str:
-    """Kill the worker process the first time that the piece is tried."""
-    try:
-        with open(marker, "x"):
-            pass
-    except FileExistsError:
-        return "survived"
-    os._exit(1)
-
-
-@pytest.fixture(scope="module")
-def address() -> Iterator[str]:
-    """A scheduler with two workers, on loopback, in processes of their own."""
-    from distributed import LocalCluster
-
-    with LocalCluster(
-        n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address=None
-    ) as cluster:
-        yield cluster.scheduler_address
-
-
-@pytest.fixture(params=["serial", "loky", "dask"])
+@pytest.fixture(params=["serial", "loky"])
 def workers(request: pytest.FixtureRequest) -> Workers:
-    if request.param == "dask":
-        return Dask(request.getfixturevalue("address"), timeout_s=PATIENCE_S)
     return Serial() if request.param == "serial" else Loky(n_jobs=2)
 
 
@@ -119,26 +87,6 @@ def test_a_piece_has_one_thread(workers: Workers) -> None:
     assert set(dict(workers.run(n_threads, range(2))).values()) == {1}
 
 
-@pytest.mark.slow
-def test_a_study_of_points_finds_the_same_numbers_on_dask(address: str, tmp_path: Path) -> None:
-    """Its fits, laws of the points left out, and the map of its law."""
-    for a in (0.6, 0.9, 1.2):
-        table = lienard(a).to_dataframe().set_axis(["n_i [m^-3]", "n_n [m^-3]"], axis=1)
-        table.to_csv(tmp_path / f"a{a}.csv", index_label="time [s]")
-    given = [
-        "+exp=predict", "data=recognised", f"points.files={tmp_path}/a{{a}}.csv", "~models",
-        "+models.own.terms={n_i: [n_i,n_n,'n_i^3'], n_n: [n_i]}", "law=1", "map_points=3",
-        "windows={n_windows: 4, periods: 2.0}", "keep=false", f"output={tmp_path}",
-    ]  # fmt: skip
-    dask = ["parallel=dask", f"parallel.address='{address}'", f"parallel.timeout_s={PATIENCE_S}"]
-    apart, alone = (computed(composed(*given, *own)) for own in (dask, ["parallel=serial"]))
-    assert {name for name, table in apart.report.tables.items() if len(table)} >= {
-        "fits", "trials", "left_out", "map",
-    }  # fmt: skip
-    for name, table in apart.report.tables.items():
-        pd.testing.assert_frame_equal(table, alone.report.tables[name], check_exact=True)
-
-
 def test_the_error_of_a_piece_arrives(workers: Workers) -> None:
     with pytest.raises(ValueError, match="got three"):
         list(workers.run(fails_on_three, range(6)))
@@ -146,46 +94,6 @@ def test_the_error_of_a_piece_arrives(workers: Workers) -> None:
 
 def test_no_pieces_are_no_results(workers: Workers) -> None:
     assert list(workers.run(total, [])) == []
-
-
-def test_pieces_of_a_dead_worker_are_done_by_another(address: str, tmp_path: object) -> None:
-    marker = str(tmp_path) + "/died"
-    workers = Dask(address, timeout_s=PATIENCE_S)
-    assert dict(workers.run(dies_once, [marker])) == {0: "survived"}
-
-
-CLUSTER = """
-from distributed import LocalCluster
-if __name__ == "__main__":
-    cluster = LocalCluster(n_workers=1, host="127.0.0.1", dashboard_address=None)
-    print(cluster.scheduler_address, flush=True)
-    input()
-"""
-
-
-@pytest.mark.slow
-def test_workers_need_not_have_the_folder_of_a_function(tmp_path: Path) -> None:
-    script = tmp_path / "cluster.py"
-    script.write_text(CLUSTER)
-    with subprocess.Popen(
-        [sys.executable, script], cwd=tmp_path, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-        text=True,
-    ) as started:  # fmt: skip
-        assert started.stdin is not None
-        assert started.stdout is not None
-        elsewhere = Dask(started.stdout.readline().strip(), timeout_s=PATIENCE_S)
-        found = dict(elsewhere.run(partial(scaled_total, factor=2.0), PIECES))
-        started.stdin.write("\n")
-    assert found == {k: 2.0 * piece.sum() for k, piece in enumerate(PIECES)}
-
-
-@pytest.mark.parametrize(
-    ("address", "hint"),
-    [("tcp://127.0.0.1:9", " within 0.1 s: .*start "), ("nowhere:nothing", "")],
-)
-def test_an_address_where_nothing_answers_is_named(address: str, hint: str) -> None:
-    with pytest.raises(OSError, match=rf"must answer at '{address}'{hint}"):
-        list(Dask(address, timeout_s=0.1).run(total, PIECES))
 
 
 def test_large_pieces_are_not_kept_on_disk(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -211,11 +119,6 @@ def test_pieces_that_are_alike_leave_this_process_only_where_it_pays(
         assert found[0][1] == os.getpid()
         assert all((found[k][1] != os.getpid()) == leave for k in (1, 2))
     assert not list(run_alike(Loky(n_jobs=2), process_of, [], 0))
-
-
-def test_a_number_of_processes_must_be_one() -> None:
-    with pytest.raises(ValueError, match="n_jobs must be a number of processes"):
-        Loky(n_jobs=0)
 
 
 WITHIN = """
@@ -306,12 +209,3 @@ def test_workers_end_with_their_run(tmp_path: Path, name: str, work: str) -> Non
         stated = run.stdout.read()
     assert not alive
     assert stated == ("" if name == "SIGKILL" else f"interrupted by {name}\n")
-
-
-def test_workers_that_are_replaced_cause_no_warning_and_others_still_do() -> None:
-    with warnings.catch_warnings(record=True) as heard:
-        warnings.simplefilter("always")
-        assert sorted(Loky(2).run(abs, [-1, -2])) == [(0, 1), (1, 2)]
-        warnings.warn("A worker stopped while some jobs were given to the executor.", stacklevel=1)
-        warnings.warn("a piece was lost", stacklevel=1)
-    assert [str(each.message) for each in heard] == ["a piece was lost"]

@@ -22,7 +22,6 @@ from ep2sindy.operating.quantities import (
 from ep2sindy.regression.constrained import solve_constrained
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.runtime.parallel import Serial
-from ep2sindy.signals.smoothers import NoSmoothing
 from ep2sindy.signals.spectrum import oscillation
 from tests.models import plain_rows
 
@@ -172,22 +171,6 @@ def test_a_point_does_not_depend_on_the_others(
         assert fitted.estimates == results[1].fits[fit].estimates
 
 
-def test_a_point_that_differs_in_its_variables_is_named(runs: list[ep.Trajectory]) -> None:
-    other = replace(runs[1], units=UNITS | {"u": "km/s"})
-    with pytest.raises(ValueError, match="operating point V=200, m=2: units must agree: 'u'"):
-        results_of([runs[0], other])
-
-
-def test_a_record_of_few_blocks_is_refused(runs: list[ep.Trajectory]) -> None:
-    short = runs[0].window(0, 800)  # eight periods of the ten that five blocks of two need
-    with pytest.raises(
-        ValueError,
-        match=r"operating point V=100, m=1: intervals need 5 blocks of time or more: blocks of 200 "
-        r"were asked of 800 groups of rows; record for longer",
-    ):
-        results_of([short], ep.Differential(NoSmoothing(), split=EVERY))
-
-
 def wave(t: np.ndarray) -> np.ndarray:
     return np.sin(2 * np.pi * t)
 
@@ -330,7 +313,7 @@ def test_two_points_say_nothing_of_how_good_a_power_law_is() -> None:
     assert np.isnan([trend.low, trend.high, trend.r2]).all()
 
 
-@pytest.mark.parametrize("x", [[], [3.0], [3.0, 3.0], [-1.0, 2.0, 3.0]])
+@pytest.mark.parametrize("x", [[3.0, 3.0], [-1.0, 2.0, 3.0]])
 def test_there_is_no_exponent_without_two_positive_values(x: list[float]) -> None:
     trend = fit_trend(np.array(x), np.ones(len(x)), np.ones(len(x)))
     assert np.isnan([trend.exponent, trend.low, trend.high, trend.r2]).all()
@@ -367,14 +350,9 @@ def test_control_laws_may_hold_reciprocals_of_what_is_never_zero() -> None:
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: Quantity("x"), "a quantity needs a coefficient such as 'n_i: n_i*u_iz', got 'x'"),
         (
             lambda: Quantity("x: x", power=2),
             "the factor not zero and the power 1 or -1, got factor=1",
-        ),
-        (
-            lambda: FittingSettings(LIBRARY, WEAK, n_windows=1, periods=0.5),
-            "refinement needs two windows or more, of some length, got n_windows=1 and periods=0.5",
         ),
         (
             lambda: Quantity("x: 1").place(MODELS["free"].relations.common, LIBRARY),

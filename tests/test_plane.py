@@ -52,7 +52,7 @@ def set_up(*, plane=False, **changes):
 
 def rows_of(n_rows, grid):
     """Room for samples of the state, as the kernels take it."""
-    rows = Rows.room(n_rows, grid)
+    rows = Rows.allocate(n_rows, grid)
     return [*rows.planes, rows.profiles, rows.series]
 
 
@@ -147,12 +147,6 @@ def test_a_plane_discharge_is_symmetric_about_mid_radius():
         scale = np.abs(values).max()
         np.testing.assert_allclose(values, sign * values[:, ::-1], rtol=0, atol=1e-10 * scale)
     assert np.abs(state.gas.u_r[inside]).max() > 100.0
-
-
-def test_a_round_discharge_is_not():
-    grid, model, state, work = set_up()
-    kernels.advance(state, model, work, 1e-7, False, *rows_of(20, grid))
-    assert np.abs(state.gas.n - state.gas.n[:, ::-1]).max() > 1e-3 * state.gas.n.max()
 
 
 def test_averages_are_means_of_the_states_in_between():
@@ -282,9 +276,7 @@ def test_second_call_reads_identical_values(tmp_path):
     ("settings", "message"),
     [
         ({"n_z": 5}, r"n_z must be 10 or more .* got 5"),
-        ({"duration_s": 1e-9}, r"duration_s must hold at least 16 sampling steps"),
         ({"thruster": Thruster(inner_radius=0.003)}, r"the plume must end before the axis"),
-        ({"thruster": Thruster(pressure_factor=1.5)}, r"pressure_factor must be 1, got 1\.5"),
     ],
 )
 def test_bad_settings_say_what_must_hold(settings, message):

@@ -47,22 +47,13 @@ def test_a_record_is_drawn_with_its_units_and_its_frequency() -> None:
     assert figure.axes[1].lines[1].get_xdata()[0] == pytest.approx(frequency)
     part = ep.plot(run, duration_s=1.0, f_max_Hz=2.0)
     assert part.axes[0].lines[0].get_xdata()[-1] == pytest.approx(1.0)
-    for setting in ({"duration_s": 0.0}, {"duration_s": -1.0}, {"f_max_Hz": -2.0}):
-        with pytest.raises(ValueError, match=f"{next(iter(setting))} must be positive and finite"):
-            ep.plot(run, **setting)
 
 
-@pytest.mark.parametrize(
-    ("method", "label"),
-    [(ep.TrajectorySearch(max_terms=3), "deviance"), (ep.Regression(), "error, $1 - R^2$ (train")],
-)
-def test_a_discovery_is_drawn_with_its_selected_candidates(
-    method: ep.TrajectorySearch | ep.Regression, label: str
-) -> None:
-    found = ep.discover(ep.lotka_volterra().trajectory(noise=0.02, rng=0), method=method)
-    for each, n in ((found, 2), (ep.Discovery.from_json(found.to_json()), 2)):
-        figure = ep.plot(each)
-        assert [text[: len(label)] for text in labels(figure)] == [label] * n
+def test_a_discovery_is_drawn_with_its_selected_candidates() -> None:
+    run = ep.lotka_volterra().trajectory(noise=0.02, rng=0)
+    found = ep.discover(run, method=ep.Regression())
+    for each in (found, ep.Discovery.from_json(found.to_json())):
+        assert len(labels(ep.plot(each))) == 2
     (ax,) = ep.plot(found.fronts["x"]).axes
     (star,) = (line for line in ax.lines if line.get_label() == "selected")
     assert star.get_xdata() == found.chosen["x"].n_terms
@@ -117,19 +108,3 @@ def test_a_law_of_one_parameter_is_drawn_as_a_line_of_its_frequency() -> None:
     assert figure.axes[0].get_xlabel() == "w (rad/s)"
     line, dots = figure.axes[0].lines[0], figure.axes[0].collections[0].get_offsets()
     assert line.get_ydata()[[0, -1]] == pytest.approx(np.asarray(dots)[:, 1], rel=1e-3)
-
-
-def test_a_law_of_two_parameters_is_drawn_as_a_map_and_of_three_not_at_all() -> None:
-    places = [[3.0, 0.0], [3.5, 0.0], [3.0, 1.0]]
-    figure = ep.plot(law(["w", "b"], places), [point(*place) for place in places], n_points=2)
-    labels(figure)
-    assert figure.axes[0].get_ylabel() == "$b$"
-    (grid,) = [each for each in figure.axes[0].collections if each.get_array() is not None][:1]
-    assert grid.get_array().size == 4
-    with pytest.raises(ValueError, match="one or two parameters: this law has"):
-        ep.plot(law(["w", "b", "c"], [[3.0, 0.0, 0.0]]), [point(3.0, 0.0, 0.0)])
-
-
-def test_what_cannot_be_drawn_says_what_can() -> None:
-    with pytest.raises(TypeError, match=r"plot draws a Discovery, Evaluation, .*, got list"):
-        ep.plot([1.0])

@@ -83,9 +83,6 @@ GAP = RAMP.assign(I_d=RAMP["I_d"].where(np.arange(N) != 70))
     [
         (crop, RAMP, {"start_s": 0.01}, r"0.01 to 0.001999 s leaves 0 of 2000, .* 0 to 0.001999"),
         *((decimate, RAMP, {"factor": n}, f"got {n} with 2000 samples") for n in (0, -2, 2000)),
-        (low_pass, RAMP, {"cutoff_Hz": 5e5}, "half the sampling rate, 500000 Hz, got 500000"),
-        (low_pass, RAMP.isel(time=slice(15)), {"cutoff_Hz": 1e5}, "of order 4 needs more than 15"),
-        (low_pass, RAMP.isel(time=np.r_[0:70, 71:90]), {"cutoff_Hz": 1e5}, r"t\[70\] - t\[69\] ="),
         (low_pass, GAP, {"cutoff_Hz": 1e5}, "I_d = nan at time = 7e-05 s"),
     ],
 )
@@ -133,10 +130,7 @@ def test_derive_does_not_overflow_in_float32() -> None:
     ("settings", "message"),
     [
         ({"expression": "u_z * 2"}, r"unknown variable 'u_z'; this field has \[.*'u_iz'"),
-        ({"expression": "2 + 3"}, "must use at least one variable"),
         ({"expression": "__import__('os')"}, "an expression may use .*"),
-        ({"expression": "u_iz.values"}, r"got 'u_iz.values'"),
-        ({"expression": "u_iz > 3"}, "w must hold real numbers: its type is bool"),
         ({"expression": "u_iz", "name": "u_ir"}, "the field already has 'u_ir'"),
     ],
 )
@@ -184,29 +178,11 @@ def test_the_rate_comes_from_a_table(tmp_path: Path) -> None:
     assert np.isnan(after["R_ion"].values[:, 2]).all()
 
 
-def test_a_table_is_not_extrapolated(tmp_path: Path) -> None:
-    (tmp_path / "rates.csv").write_text("1,1e-22\n15,5e-14\n")
-    with pytest.raises(ValueError, match="1 to 15 eV: it runs from 5 to 20 eV; extend .*rates.csv"):
-        ionization_rate(precompile(), table=tmp_path / "rates.csv")
-
-
 @pytest.mark.parametrize("text", ["1,1e-22\n", "5,1\n1,2\n", "a,b\nc,d\n"])
 def test_a_bad_table_is_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "rates.csv").write_text(text)
     with pytest.raises(ValueError, match="a rate table must have two columns"):
         read_rate_table(tmp_path / "rates.csv")
-
-
-def test_a_missing_table_is_named(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="no such rate table: .*none.csv"):
-        ionization_rate(precompile(), table=tmp_path / "none.csv")
-
-
-def test_the_rate_is_never_overwritten_nor_guessed() -> None:
-    with pytest.raises(ValueError, match="the field already has R_ion: leave this step out"):
-        ionization_rate(ionization_rate(precompile()))
-    with pytest.raises(ValueError, match=r"R_ion needs T_e_eV; this field has \['I_d'\]"):
-        ionization_rate(ramp())
 
 
 def radial(r: list[float]) -> xr.Dataset:
@@ -237,11 +213,6 @@ def test_radial_velocity_counts_from_mid_radius(
     assert before["u_ir"].values[0, 0] == 1.0
 
 
-def test_mid_radius_without_a_radial_velocity_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"needs u_ir on r: .* \['I_d'\] on \['time'\]"):
-        radial_from_middle(ramp())
-
-
 @pytest.mark.parametrize("gas", ["krypton", "argon"])
 def test_other_gases_have_rates_of_their_own(gas: str) -> None:
     after = ionization_rate(precompile(), gas=gas)
@@ -257,8 +228,6 @@ def test_a_gas_has_its_range_and_its_own_table(tmp_path: Path) -> None:
     hot["T_e_eV"] *= 20
     with pytest.raises(ValueError, match="T_e_eV must stay in the rate table, 0 to 100 eV"):
         ionization_rate(hot, gas="krypton")
-    with pytest.raises(ValueError, match="there are the propellants .*, got 'neon'"):
-        ionization_rate(precompile(), gas="neon")
     with pytest.raises(ValueError, match="got gas='argon' next to"):
         ionization_rate(precompile(), gas="argon", table=tmp_path / "rates.csv")
 
@@ -333,7 +302,6 @@ def test_a_gradient_without_faces_takes_the_average_of_the_product() -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"of": "n_i", "axis": "r"}, r"two or more cells along z or r.*'z': 4.*"),
         ({"of": "I_d"}, r"gradient of 'I_d' along 'z' needs .*sizes \{'time': 2\}"),
         ({"of": "n_i", "name": "n_i"}, "already has 'n_i'"),
     ],

@@ -82,25 +82,6 @@ def test_signs_are_those_of_the_coefficients() -> None:
     assert texts(ROLES, back)[0].startswith("n_i' = -n_i n_n (1.62e-32 n_i + 3.12e-33 n_n) + n_i (")
 
 
-@pytest.mark.parametrize("back", [["n_i"], {"n_i": 1e5}])
-def test_an_interval_of_a_sum_is_not_that_of_its_processes(back) -> None:
-    """Ions return and leave by n_i: only n_n' tells what returns, and a stated process has none."""
-    exchange = [("n_n", "n_i", ["n_i*n_n"]), ("n_i", "n_n", back)]
-    roles = replace(ROLES, exchange=exchange, outflow={"n_i": ["n_i"], "n_n": ["n_n"]})
-    coef = {
-        "n_i": {"n_i": -5e5, "n_i*n_n": 4e-14},
-        "n_n": {"1": 2.31e23, "n_i": 1e5, "n_n": -3e3, "n_i*n_n": -4e-14},
-    }
-    found = isinstance(back, list)
-    reach = {"n_i": {"n_i": 7e3}, "n_n": {"n_n": 50.0, "n_i": 2e3 if found else 0.0}}
-    returned = "1e+05 (±2e+03) n_i" if found else "1e+05 n_i"
-    leaving = "4e+05 n_i" if found else "4e+05 (±7e+03) n_i"
-    assert texts(roles, coef, reach=reach) == [
-        f"n_i' = 4e-14 n_i n_n - {returned} - {leaving}",
-        f"n_n' = 2.31e+23 - 4e-14 n_i n_n + {returned} - 3e+03 (±50) n_n",
-    ]
-
-
 def test_a_small_zone_gives_a_large_one_less() -> None:
     zones = {"a": 1.0, "b": 2.0}
     roles = ep.Roles(exchange=[("n_n", "n_i")], outflow=STATES, inflow={"n_n": 3.0}).in_zones(zones)
@@ -122,24 +103,3 @@ def test_a_small_zone_gives_a_large_one_less() -> None:
             for term, value in group.terms.items():
                 total[term] = total.get(term, 0.0) + group.sign * value
         assert total == pytest.approx({t: v for t, v in given[state].items() if v})
-
-
-def test_a_discovery_under_roles_is_printed_by_process() -> None:
-    rng = np.random.default_rng(0)
-    library = ep.polynomial(["x", "y"], degree=2)
-    coef = ep.model.coef_matrix(
-        library, [{"1": 1.0, "x": -0.5, "x*y": -1.0}, {"x*y": 1.0, "y": -0.6}]
-    )
-    truth = ep.SparseModel(library, ["x", "y"], coef, {"x": "1", "y": "1"})
-    t = np.linspace(0.0, 20.0, 801)
-    run = ep.Trajectory(t, truth.simulate(t, [1.5, 0.3]).states, ["x", "y"])
-    run = replace(run, states=run.states + 1e-6 * rng.normal(size=run.states.shape))
-    roles = ep.Roles(exchange=[("x", "y")], outflow=["x", "y"], inflow={"x": 1.0}, nonnegative=True)
-    method = ep.Regression(
-        search=ep.BestSubset(max_terms=3, n_best=60),
-        selection=ep.FreeRunScore(bounds=None),
-        depth=6,
-    )
-    found = ep.discover(run, library.with_roles(roles), method)
-    assert re.search(r"x' = 1 - 1 \(.*\) x y - 0\.5 \(.*\) x \[", repr(found))
-    assert "<i>x</i>" in found._repr_html_()

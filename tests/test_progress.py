@@ -1,146 +1,26 @@
-"""Stages of long work: who is informed, how bars look, and that results do not change."""
-
-import inspect
-import io
-import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+"""Stages of long work: whoever watches them changes no result."""
 
 import numpy as np
-import pytest
 
 import ep2sindy as ep
-from ep2sindy._stubs import dotted_names
-from ep2sindy.runtime.progress import SILENT, Bars, CallbackProgress, as_progress, count_pieces
+from ep2sindy.runtime.progress import SILENT, Bars, as_progress
 
 LIBRARY = ep.polynomial(["x", "y"], degree=2)
-BRIEF = {"duration_s": 3e-5, "warm_up_s": 3e-6}
+METHOD = ep.Regression(ep.Differential(), ep.BestSubset(max_terms=2), ep.EBIC(), ep.Bootstraps(n=4))
 
 
-@dataclass
-class Stage:
-    label: str
-    unit: str
-    total: int | None
-    done: int = 0
-    over: bool = False
-
-
-@dataclass
-class Recorder:
-    """A progress that keeps every stage, in the order in which they began."""
-
-    stages: list[Stage] = field(default_factory=list)
-
-    @contextmanager
-    def stage(self, total: int | None, unit: str, label: str = "") -> Iterator[Callable]:
-        own = Stage(label, unit, total)
-        self.stages.append(own)
-
-        def advance(n_more: int) -> None:
-            own.done += n_more
-
-        try:
-            yield advance
-        finally:
-            own.over = True
-
-
-@pytest.fixture(scope="module")
-def prey() -> ep.Trajectory:
-    return ep.lotka_volterra().trajectory(noise=0.01, rng=0)
-
-
-def regression(selection: object = None, **settings: object) -> ep.Regression:
-    return ep.Regression(
-        ep.Differential(),
-        ep.BestSubset(max_terms=2),
-        selection or ep.EBIC(),
-        ep.Bootstraps(**({"n": 4} | settings)),
-    )
-
-
-def test_a_regression_tells_its_stages_in_order(prey: ep.Trajectory) -> None:
-    watch = Recorder()
-    ep.discover(prey, LIBRARY, regression(), progress=watch)
-    assert [each.label for each in watch.stages] == [
-        "rows of the regression", "draws of rows", "search for x'", "search for y'",
-        "candidates by EBIC",
-    ]  # fmt: skip
-    assert [each.total for each in watch.stages if each.unit == "draw"] == [4, 4]
-    assert all(each.over for each in watch.stages)
-    assert all(each.done == each.total for each in watch.stages if each.total is not None)
-
-
-def test_a_result_does_not_depend_on_who_watches(prey: ep.Trajectory) -> None:
-    watched, alone = (
-        ep.discover(prey, LIBRARY, regression(), seed=1, **more)  # type: ignore[arg-type]
-        for more in ({"progress": Recorder()}, {})
-    )
+def test_a_result_does_not_depend_on_who_watches() -> None:
+    prey = ep.lotka_volterra().trajectory(noise=0.01, rng=0)
+    counted: list[int] = []
+    alone = ep.discover(prey, LIBRARY, METHOD, seed=1)
+    watched = ep.discover(prey, LIBRARY, METHOD, seed=1, progress=counted.append)
+    assert sum(counted) > 0
     np.testing.assert_array_equal(watched.model.coef, alone.model.coef)
     np.testing.assert_array_equal(watched.model.covariance, alone.model.covariance)
     for state in ("x", "y"):
         np.testing.assert_array_equal(watched.scores[state], alone.scores[state])
 
 
-def test_what_fails_leaves_its_stage() -> None:
-    watch = Recorder()
-    with pytest.raises(ZeroDivisionError), watch.stage(2, "piece"):
-        1 / 0  # noqa: B018
-    for _ in (pieces := count_pieces(watch, [1, 2], "piece")):
-        break
-    pieces.close()
-    assert [(each.done, each.over) for each in watch.stages] == [(0, True), (0, True)]
-
-
-def test_whoever_is_not_asked_is_silent(prey: ep.Trajectory, capfd: pytest.CaptureFixture) -> None:
-    """Whatever can tell its progress does so on request; simulators ask for themselves."""
-    asking = {
-        entry.name: parameter.default
-        for entry in dotted_names().values()
-        if inspect.isfunction(value := entry.load())
-        and (parameter := inspect.signature(value).parameters.get("progress"))
-    }
-    simulators = {name for name, default in asking.items() if default is True}
-    assert simulators == {"simulate", "simulate_2d"}
-    assert {asking[name] for name in set(asking) - simulators} == {False}
-    assert {"discover", "estimate", "refine", "pointwise"} <= set(asking)
-    ep.discover(prey, LIBRARY, regression())
-    assert capfd.readouterr() == ("", "")
-
-
-def test_logs_and_pipes_see_no_bars(prey: ep.Trajectory, capfd: pytest.CaptureFixture) -> None:
-    ep.discover(prey, LIBRARY, regression(), progress=True)
-    assert capfd.readouterr() == ("", "")
-
-
-class Terminal(io.StringIO):
-    def isatty(self) -> bool:
-        return True
-
-
-def test_a_terminal_sees_label_count_and_unit_and_then_nothing(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    terminal = Terminal()
-    monkeypatch.setattr(sys, "stderr", terminal)
-    with Bars().stage(3, "system", "refined") as advance:
-        first = terminal.getvalue()
-        assert "refined:   0%" in first
-        assert "0/3 system [" in first
-        advance(3)
-    assert terminal.getvalue().endswith("\r")
-    assert not terminal.getvalue().split("\r")[-2].strip()
-
-
-def test_true_means_bars_and_a_function_is_stated() -> None:
+def test_true_means_bars_and_false_silence() -> None:
     assert as_progress(True) == Bars()
     assert as_progress(False) is SILENT
-    watch, numbers = Recorder(), []
-    assert as_progress(watch) is watch
-    stated = as_progress(numbers.append)
-    assert isinstance(stated, CallbackProgress)
-    with stated.stage(2, "point") as advance:
-        advance(2)
-    assert numbers == [2]

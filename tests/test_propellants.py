@@ -1,7 +1,5 @@
 """Rate coefficients of the propellants: against published figures, and tables that are refused."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -10,9 +8,7 @@ from ep2sindy.thruster.closures import FURTHER, TABLE_STEP_EV, TRANSITIONS, clos
 from ep2sindy.thruster.constants import ATOMIC_MASS, E_CHARGE, M_ELECTRON
 from ep2sindy.thruster.propellants import (
     FURTHER_IONIZATIONS,
-    PropellantTable,
     XenonFits,
-    describe_uncovered,
     ionization_rate,
     thermal_speed,
 )
@@ -166,15 +162,7 @@ def test_a_table_over_the_mean_energy_is_the_same_gas(tmp_path):
 @pytest.mark.parametrize(
     ("text", "change", "message"),
     [
-        ("T_e_eV,ionization,excitation\n1,0,0\n2,0,0\n", {}, r"must have the columns T_e_eV or"),
-        (HEADER + "1,0,0,1e-13\n2,,0,1e-13\n", {}, r"4 numbers in every row: row 2 .*fill the gap"),
         (HEADER + "2,0,0,1e-13\n1,0,0,1e-13\n", {}, r"T_e_eV must increase: 1 follows 2"),
-        (HEADER + ROWS, {"second_ionization_eV": 21.0}, r"needs both its column and second_ioni"),
-        (
-            "T_e_eV,ionization,excitation,momentum,second_ionization\n1,0,0,0,0\n9,0,0,0,1e-14\n",
-            {"second_ionization_eV": 21.0},
-            r"a second charge needs double_ionization, second_ionization, .* own lacks double_ion",
-        ),
     ],
 )
 def test_a_table_that_cannot_be_taken_says_why(tmp_path, text, change, message):
@@ -184,44 +172,10 @@ def test_a_table_that_cannot_be_taken_says_why(tmp_path, text, change, message):
         ep.thruster.read_propellant(path, **(OWN | change))
 
 
-def test_a_gas_that_is_not_there_is_named(tmp_path):
-    with pytest.raises(ValueError, match=r"there are the propellants \['argon', 'krypton', 'xenon"):
-        ep.thruster.propellant("iodine")
-    with pytest.raises(ValueError, match=r"no such table of a propellant: .*none\.csv"):
-        ep.thruster.read_propellant(tmp_path / "none.csv", **OWN)
-
-
-def test_rates_must_cover_the_ends_of_the_discharge():
-    short = PropellantTable(
-        "own", 2e-25, 12.0, 8.0, (4.0, 60.0), (0.0, 1e-13), (0.0,) * 2, (0.0,) * 2
-    )
-    with pytest.raises(ValueError, match=r"rates of own cover T_e from 4 to 60 eV, and it is 3 eV"):
-        ep.thruster.Thruster(propellant=short)
-
-
-def test_a_run_beyond_the_table_says_how_far_it_got():
-    assert describe_uncovered(ep.thruster.propellant("krypton"), 99.0) is None
-    assert describe_uncovered(XenonFits(), 199.0) is None
-    krypton = ep.thruster.propellant("krypton")
-    message = (
-        "the rates of krypton cover T_e up to 100 eV, and the run reached T_e + 2K/3 (K: energy of "
-        "the electrons' drift) of 120 eV, where the value at 100 eV is taken; extend the table"
-    )
-    assert describe_uncovered(krypton, 120.0) == message
-    still = replace(krypton, drift_weight=0.0)
-    assert "and the run reached T_e of 120 eV, where" in str(describe_uncovered(still, 120.0))
-
-
 def test_a_charge_needs_its_rates():
     argon = ep.thruster.propellant("argon")
     with pytest.raises(ValueError, match=r"charge_states 2 needs .* argon has .* to 1"):
         ep.thruster.Thruster(charge_states=2, propellant=argon)
-    with pytest.raises(
-        ValueError, match=r"charge_states 2 needs rates .* XenonFits has them up to"
-    ):
-        ep.thruster.Thruster(charge_states=2)
-    with pytest.raises(ValueError, match=r"charge_states must be 1, 2 or 3, got 4"):
-        ep.thruster.Thruster(charge_states=4, propellant=ep.thruster.propellant("xenon"))
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,6 @@ import pytest
 pytest.importorskip("pysindy")
 
 from benchmarks.pysindy_variants import (
-    PySINDyAsItComes,
     PySINDyEnsemble,
     PySINDySmoothing,
     PySINDySsr,
@@ -119,27 +118,3 @@ def test_the_least_aicc_is_chosen() -> None:
     assert least_aicc([few, more], 20) == {"x"}
     assert least_aicc([few, (("x", "y"), 0.93)], 20) == {"x", "y"}
     assert least_aicc([(("x",), 0.01)], 20) == frozenset()
-
-
-def test_a_user_who_chooses_by_aicc_selects() -> None:
-    system = lotka_volterra()
-    run, rng = system.trajectory(), np.random.default_rng(0)
-    truth = {state: frozenset(system.model.terms(state)) for state in system.model.states}
-    chosen = PySINDyVariant(PySINDyStlsq(), aicc=True).find([run], system.model.library, rng=rng)
-    assert chosen.selected is not None
-    assert all(truth[state] <= chosen.selected[state] for state in truth)
-    assert (
-        PySINDyVariant(PySINDyStlsq()).find([run], system.model.library, rng=rng).selected is None
-    )
-
-
-def test_pysindy_as_it_comes_is_its_own_default() -> None:
-    pysindy = pytest.importorskip("pysindy")
-    system = lotka_volterra()
-    run, rng = system.trajectory(), np.random.default_rng(0)
-    found = PySINDyAsItComes().find([run], system.model.library, rng=rng)
-    model = pysindy.SINDy(feature_library=pysindy.PolynomialLibrary(degree=2))
-    model.fit(run.states, t=run.t)
-    assert found.selected is not None
-    assert sum(map(len, found.selected.values())) == np.count_nonzero(model.coefficients())
-    assert found.selected == {state: kept[0] for state, kept in found.kept.items()}

@@ -2,7 +2,6 @@ from dataclasses import replace
 from functools import cache, partial
 
 import numpy as np
-import pandas as pd
 import pytest
 import torch
 from scipy.integrate import solve_ivp
@@ -223,6 +222,7 @@ def test_keywords_stand_for_what_settings_say() -> None:
     )
     assert (by_periods.window, by_periods.periods, by_periods.n_windows) == (40, None, 30)
     assert ep.refine([], [], seed=1) == []
+    assert ep.refine(PREY.model, data, settings, seed=1).model == by_settings.model
     (first, second) = ep.refine([PREY.model] * 2, [[data]] * 2, settings, seed=1)
     np.testing.assert_array_equal(first.model.coef, by_settings.model.coef)
     assert second.batch.start.tolist() != first.batch.start.tolist()  # windows of its own
@@ -245,12 +245,10 @@ def test_windows_are_as_many_periods_as_are_asked_for() -> None:
     ("settings", "message"),
     [
         ({"window": 4}, "at least one window of 5 samples is needed: n_windows=30, window=4"),
-        ({"n_windows": 0}, "n_windows must be a whole number, one or more, got 0"),
         (
             {"window": 20, "periods": 1.0},
             "by its samples or by its periods, got window=20 and periods",
         ),
-        ({"periods": 0.0}, "periods must be positive, got 0.0"),
     ],
 )
 def test_settings_that_say_nothing_or_two_things_are_refused(
@@ -317,8 +315,6 @@ def test_start_that_blows_up_is_a_result() -> None:
     found = ep.refine(model, [clean(PREY)], window=50, n_windows=3, seed=rng)
     assert found.status == "non_finite"
     assert found.loss == np.inf
-    assert "window 0 (from sample " in found.message
-    assert found.message.endswith("follows no finite trajectory beyond sample 1")
     np.testing.assert_array_equal(found.model.coef, model.coef)
 
 
@@ -345,46 +341,15 @@ def test_models_of_different_terms_are_refined_and_assessed_as_if_alone(method: 
     assert together[1].status == "converged"
 
 
-def test_models_of_different_states_are_refused_in_one_batch() -> None:
-    library = ep.named_terms(["x", "y"], ["x", "y"])
-    coef = -np.ones((2, 1))
-    models = [ep.SparseModel(library, [state], coef) for state in ("x", "y")]
-    run = clean(PREY)
-    data = [
-        [ep.Trajectory(run.t, run.columns([a]), [a], run.columns([b]), [b])]
-        for a, b in (("x", "y"), ("y", "x"))
-    ]
-    with pytest.raises(ValueError, match="must share their states and inputs"):
-        ep.refine(
-            models, data, ep.refinement.RefinementSettings(window=50), seed=np.random.default_rng(0)
-        )
-
-
-def test_one_run_is_a_list_of_one_and_the_seed_is_zero() -> None:
-    data = noisy(PREY, 0.02, np.random.default_rng(0))
-    settings = ep.refinement.RefinementSettings(n_windows=3, window=30)
-    known = ep.refine(PREY.model, [data], settings, seed=0).model
-    arrays = {"t": data.t, **dict(zip(data.state_names, data.states.T, strict=True))}
-    for run in (data, pd.DataFrame(arrays)):
-        assert ep.refine(PREY.model, run, settings).model == known
-
-
 def test_bad_input_is_refused() -> None:
     rng = np.random.default_rng(0)
     data, model = clean(PREY), PREY.model
     with pytest.raises(ValueError, match="1001 samples were asked of at most 1000"):
         ep.refine(model, [data], window=1001, seed=rng)
-    with pytest.raises(ValueError, match="at least one term"):
-        ep.refine(off(model, 0.0), [data], seed=rng)
-    with pytest.raises(ValueError, match="at least one run is needed"):
-        ep.refine(model, [], window=50)
     with pytest.raises(
         ValueError, match="a list of trajectories of its own, got 2 models and 1 lists"
     ):
         ep.refine([model] * 2, [[data]], ep.refinement.RefinementSettings(window=50), seed=rng)
-    for runs, came in ((data, "one run"), ([data], "a list of runs")):
-        with pytest.raises(ValueError, match=f"as in refine.* 1 models with {came}"):
-            ep.refine([model], runs, window=50, seed=rng)
 
 
 @cache
@@ -409,7 +374,9 @@ def stiff(k_dt: float) -> tuple[ep.SparseModel, ep.Trajectory]:
     return model, ep.Trajectory(t, solution.y.T, ["x", "y", "z"])
 
 
-@pytest.mark.parametrize("noise", [0.0, pytest.param(0.01, marks=pytest.mark.slow), 0.05])
+@pytest.mark.parametrize(
+    "noise", [*(pytest.param(n, marks=pytest.mark.slow) for n in (0.0, 0.01)), 0.05]
+)
 @pytest.mark.parametrize("k_dt", [0.5, 2.0, 5.0, 20.0])
 @pytest.mark.parametrize("step", [RungeKutta(), RungeKutta(32)])
 def test_stiff_model_is_right_or_says_that_it_is_not(

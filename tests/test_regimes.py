@@ -195,14 +195,6 @@ def test_axes_may_come_in_any_order() -> None:
     assert found_in(turned).labels.equals(found_in(patched()).labels)
 
 
-def test_regimes_tell_whether_they_are_as_many_as_allowed() -> None:
-    limits = {
-        n: find_regimes(patched(), rng=np.random.default_rng(0), max_regimes=n).at_limit
-        for n in (1, 2, 3)
-    }
-    assert limits == {1: True, 2: True, 3: False}
-
-
 def test_the_table_counts_the_points_that_are_unsure() -> None:
     draws = np.array(patched()["weight_draws"].values)
     draws[:, 0, 1, 3, 2] = 1.0  # all say source, where the whole says sink
@@ -262,19 +254,3 @@ def test_a_study_without_any_equation_has_no_regimes() -> None:
     nothing = np.full((2, 2, 4, 3), np.nan)
     with pytest.raises(ValueError, match="none of the 12 points of the study has any"):
         found_in(patched(weight=nothing))
-
-
-def test_regimes_need_bootstraps() -> None:
-    with pytest.raises(ValueError, match="needs bootstraps"):
-        found_in(patched(weight_draws=np.empty((0, 2, 2, 4, 3))))
-
-
-def test_no_regime_at_all_is_refused() -> None:
-    weights, draws = points()
-    with pytest.raises(ValueError, match="max_regimes"):
-        group_points(weights, draws, rng=np.random.default_rng(0), max_regimes=0)
-
-
-def test_equations_of_a_regime_that_is_not_there_are_refused() -> None:
-    with pytest.raises(ValueError, match="regimes run from 0 to 1, got 2"):
-        found_in(patched()).equations(2)

@@ -56,14 +56,6 @@ def test_block_split_holds_out_whole_blocks() -> None:
     assert np.all(np.ptp(held_out.reshape(20, 20).astype(int), axis=1) == 0)
 
 
-@pytest.mark.parametrize(
-    ("split", "fraction"), [(ep.regression.RandomSplit, 1.0), (ep.regression.BlockSplit, -0.1)]
-)
-def test_impossible_shares_are_refused(split: type, fraction: float) -> None:
-    with pytest.raises(ValueError, match=r"test_fraction must lie in \[0, 1\)"):
-        split(fraction)
-
-
 def test_gram_matrix_is_the_weighted_product_of_unit_columns() -> None:
     rng = np.random.default_rng(0)
     theta, target = rng.normal(size=(30, 3)) * [1e18, 1.0, 1e-14], rng.normal(size=(30, 1))
@@ -80,14 +72,6 @@ def test_columns_at_the_edge_of_the_number_format_keep_finite_norms() -> None:
     theta = np.array([[1e200, 1.0], [2e200, 3.0], [-1e200, 2.0]])
     problem = plain_rows(theta, np.ones((3, 1)), ["a", "b"])
     assert problem.theta_scale[0] == pytest.approx(np.sqrt(6.0) * 1e200)
-
-
-def test_a_library_larger_than_the_rows_is_refused() -> None:
-    run = cubic(np.linspace(0, 1, 12), "short")
-    with pytest.raises(ValueError, match=r"library of 16 terms needs .* 9 of 12 rows"):
-        ep.Differential().assemble(
-            [run], ep.polynomial(["x"], degree=15), rng=np.random.default_rng(0)
-        )
 
 
 def test_an_overflowing_term_is_named() -> None:
@@ -153,15 +137,6 @@ def test_of_dependent_terms_the_simplest_are_kept() -> None:
         "'x*u^2' is a multiple of 'x*u' on every row and is left out",
         "c^2 is a linear combination of s^2, 1 on every row and is left out",
     ]
-
-
-def test_the_user_is_stated_what_cannot_be_stated_apart() -> None:
-    messages = [a.message for a in ambiguities(degenerate())]
-    assert "'zero' is zero on every row and is left out" in messages
-    assert "'minus_3a' is a multiple of 'a' on every row and is left out" in messages
-    combination = "a_plus_2b is a linear combination of a, b on every row"
-    assert f"{combination} and is left out" in messages
-    assert any("'a' and 'nearly_a' are nearly proportional" in m for m in messages)
 
 
 def test_a_combination_of_many_terms_is_named_and_stays_in_the_search() -> None:

@@ -1,7 +1,5 @@
 """What a study reports: in its folder, on the terminal, the page and in TensorBoard."""
 
-from collections.abc import Callable
-from io import StringIO
 from pathlib import Path
 
 import numpy as np
@@ -9,139 +7,15 @@ import pandas as pd
 import pytest
 from matplotlib.figure import Figure
 from omegaconf import DictConfig, OmegaConf
-from rich.console import Console
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import ep2sindy as ep
 from ep2sindy.app.runner import start_run
-from ep2sindy.figures.style import hover
-from ep2sindy.report.about import settings_used
-from ep2sindy.report.document import Equation, Picture, Result, Section, Table, Text
-from ep2sindy.report.page import page_html, powers_html
-from ep2sindy.report.picture import draw
-from ep2sindy.report.report import Report
+from ep2sindy.report.document import Result, Table, Text
 from ep2sindy.report.results import Metric, ResultTable, View
-from ep2sindy.report.screen import WIDTH, Screen, rich_table
-from ep2sindy.report.tensorboard import Board
 from tests.programs import summary_of
 
 ROWS = pd.DataFrame({"n_terms": [1, 2], "r2": [0.5, float("nan")], "text": ["a < b", "[c]"]})
-SECTIONS = [
-    Section(
-        "Fronts & models",
-        [
-            Text("short"),
-            Text("long", page_only=True),
-            Text("amiss", warning=True),
-            Equation("n_i", {"n_i": -2.0}, lead="thesis", on_screen=True),
-            Equation("n_n", {"n_n": 3.0}),
-            Table(ROWS, title="candidates", bold=[1], italic=[0], note="a note"),
-            Picture("front"),
-            Picture("absent"),
-        ],
-    ),
-    Section("Only a picture", [Picture("front")], level=3),
-]
-PIXEL = b"any bytes: a page embeds what it is given"
-FIGURES = {"front": draw(Figure(figsize=(4.0, 3.0)), PIXEL, "Error against size <&>.")}
-
-
-@pytest.fixture
-def log(tmp_path: Path) -> str:
-    screen = Screen(tmp_path / "run.log")
-    screen.show(SECTIONS)
-    screen.close()
-    return (tmp_path / "run.log").read_text()
-
-
-def test_a_screen_shows_what_fits_a_screen(log: str) -> None:
-    for text in ("Fronts & models", "short", "amiss", "thesis: n_i' = -2 n_i", "candidates"):
-        assert text in log
-    for text in ("a < b", "[c]", "a note"):  # markup of ours must not eat a user's brackets
-        assert text in log
-    for text in ("long", "n_n", "Only a picture", "caption"):
-        assert text not in log
-    assert max(map(len, log.splitlines())) <= WIDTH
-
-
-@pytest.mark.parametrize("width", [50, 80, WIDTH])
-def test_marks_and_terms_stay_whole_at_any_width(width: int) -> None:
-    """Piped, and in run.log, a row has no colour: the mark alone says what is selected."""
-    equation = "n_i' = -1.77e+18 n_i R_ion + 7.79e-34 n_i n_n^2 - 3.45e+05 n_i  <- selected"
-    table = Table(pd.DataFrame({"terms": ["2"], "R2 test": ["0.978"], "model": [equation]}))
-    lines = printed(table, width).splitlines()
-    assert max(map(len, lines)) <= width
-    for whole in ("<- selected", "-1.77e+18 n_i R_ion", "+ 7.79e-34 n_i n_n^2", "- 3.45e+05 n_i"):
-        assert sum(whole in line for line in lines) == 1
-
-
-def printed(table: Table, width: int) -> str:
-    console = Console(file=StringIO(), width=width, no_color=True)
-    console.print(rich_table(table))
-    return console.file.getvalue()  # type: ignore[attr-defined]
-
-
-def test_a_page_marks_rows_and_escapes_text() -> None:
-    page = page_html("a <study>", SECTIONS, FIGURES)
-    assert "<h1>a &lt;study&gt;</h1>" in page
-    number = '<td class="number">{}</td>'
-    bold = "".join([*map(number.format, ("2", "-")), "<td>[c]</td>"])
-    italic = "".join([*map(number.format, ("1", "0.5")), "<td>a &lt; b</td>"])
-    assert f'<tr class="bold">{bold}</tr>' in page
-    assert f'<tr class="italic">{italic}</tr>' in page
-    assert "<p>long</p>" in page
-    assert '<p class="warning">amiss</p>' in page
-    assert '<p class="equation">thesis: <span class="math"><math' in page
-
-
-@pytest.mark.parametrize(
-    ("text", "html"),
-    [
-        ("m^-3 s^-1", "m<sup>−3</sup> s<sup>−1</sup>"),
-        ("1.4232e+23 ±3e+19", "1.4232·10<sup>23</sup> ±3·10<sup>19</sup>"),
-        ("x < 1e3, 2024-05-01, V1e3", "x &lt; 1·10<sup>3</sup>, 2024-05-01, V1e3"),
-        ("--seed -1", "--seed -1"),
-    ],
-)
-def test_powers_are_raised_in_all_texts(text: str, html: str) -> None:
-    assert powers_html(text) == html
-
-
-def _hovering(text: str) -> Figure:
-    figure = Figure(figsize=(4.0, 3.0))
-    (line,) = figure.subplots().plot([0.0, 1.0], "o")
-    hover(line, f"{text} | second line")
-    return figure
-
-
-def test_marks_of_a_figure_say_more_under_the_mouse() -> None:
-    html = draw(_hovering("n_i' of 2 terms"), PIXEL, "A front.").html
-    assert "<title>n_i' of 2 terms\nsecond line</title>" in html
-    assert "hover" not in html
-    assert html == draw(_hovering("n_i' of 2 terms"), PIXEL, "A front.").html
-
-
-def test_settings_read_in_words() -> None:
-    variables = {"x": {"name": "X", "unit": "1"}, "y": {"name": None, "unit": "m"}}
-    settings = {
-        "data": {"path": "a.csv", "variables": variables, "channel_m": None},
-        "trajectory": {"_target_": "ep2sindy.data.ZoneAverage", "states": ["x"]},
-        "rollout_s": 4.0e-3,
-        "other": 3,
-    }
-    assert settings_used(settings, set(settings) - {"other"}) == {
-        "data": "path a.csv, variables (x (name X, unit 1))",
-        "time series": "ZoneAverage (states x)",
-        "rollout s": "0.004",
-    }
-
-
-def test_a_page_shows_the_figures_there_are() -> None:
-    page = page_html("a study", SECTIONS, FIGURES)
-    assert page.count('src="data:image/png;base64,') == 2
-    assert "--width: 384px" in page  # four inches
-    assert "Error against size &lt;&amp;&gt;." in page
-    assert "absent" not in page
 
 
 MODEL = ep.lotka_volterra().model
@@ -211,58 +85,9 @@ def test_what_was_written_outlives_a_later_error(toy: DictConfig) -> None:
     assert not {"summary.json", "report.html", "figures"} & {path.name for path in folder.iterdir()}
 
 
-def test_a_study_must_say_what_it_found(toy: DictConfig) -> None:
-    with start_run(toy) as report, pytest.raises(ValueError, match="must say what it found"):
-        report.finish()
-
-
-@pytest.mark.parametrize(
-    ("kind", "add"),
-    [
-        ("model", lambda report: report.model("a", MODEL)),
-        ("table", lambda report: report.table("a", ROWS)),
-        ("table", lambda report: report.samples("a", ROWS)),
-        ("figure", lambda report: report.figure("a", line, "")),
-    ],
-)
-def test_two_of_one_name_are_an_error(
-    kind: str, add: Callable[[Report], None], toy: DictConfig
-) -> None:
+def test_two_of_one_name_are_an_error(toy: DictConfig) -> None:
     with start_run(toy) as report:
-        add(report)
-        with pytest.raises(ValueError, match=f"every {kind} .* a name of its own, got 'a' twice"):
-            add(report)
-        if kind == "table":
-            with pytest.raises(ValueError, match="got 'a' twice"):
-                report.table("a", SIZES)
-            assert report.tables["a"] is ROWS
-
-
-def test_tensorboard_reads_what_a_run_tells_it(tmp_path: Path) -> None:
-    png = tmp_path / "figure.png"
-    line().savefig(png, dpi=100)
-    board = Board(tmp_path / "run" / "tensorboard")
-    board.scalars({"loss": 0.5}, step=1)
-    board.scalars({"loss": 0.25}, step=2)
-    board.image("front", png.read_bytes())
-    board.equations({"one": "x' = y\ny' = -x", "two": "x' = 1"})
-    board.settings({"seed": 3, "search": "BestSubset"}, {"r2": 0.75})
-    board.close()
-    events = EventAccumulator(str(tmp_path / "run" / "tensorboard")).Reload()
-    assert [(e.step, e.value) for e in events.Scalars("loss")] == [(1, 0.5), (2, 0.25)]
-    assert events.Scalars("r2")[0].value == 0.75
-    (image,) = events.Images("front")
-    assert (image.width, image.height) == (300, 200)
-    assert image.encoded_image_string == png.read_bytes()
-    (text,) = events.Tensors("equations")
-    lines = text.tensor_proto.string_val[0].decode().splitlines()
-    assert [line[:4].strip() for line in lines] == [""] * 6  # one block of code
-    assert "      y' = -x" in lines
-    plugins = events.PluginTagToContent("hparams")
-    assert set(plugins) == {"_hparams_/session_start_info"}
-    assert b"BestSubset" in plugins["_hparams_/session_start_info"]
-
-
-def test_a_board_without_a_word_leaves_no_file(tmp_path: Path) -> None:
-    Board(tmp_path / "tensorboard").close()
-    assert not (tmp_path / "tensorboard").exists()
+        report.table("a", ROWS)
+        with pytest.raises(ValueError, match="a name of its own, got 'a' twice"):
+            report.table("a", SIZES)
+        assert report.tables["a"] is ROWS

@@ -3,14 +3,8 @@ import pytest
 
 import ep2sindy as ep
 from ep2sindy.regression import bootstraps
-from ep2sindy.regression.bootstraps import Bootstraps, count_block_draws
+from ep2sindy.regression.bootstraps import Bootstraps
 from ep2sindy.regression.rows import RegressionRows
-
-
-@pytest.mark.parametrize("block", [0, 31])
-def test_a_block_must_fit(block: int) -> None:
-    with pytest.raises(ValueError, match=f"all 30 groups of training rows, got {block}"):
-        count_block_draws(30, n_drawn=10, block=block, rng=np.random.default_rng(0))
 
 
 def test_bootstraps_draw_neighbours_together() -> None:

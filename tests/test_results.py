@@ -3,8 +3,6 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import pytest
-
 from ep2sindy.report.results import Metric, ResultTable, View, percent
 
 
@@ -42,24 +40,6 @@ def test_a_row_per_state_repeats_what_has_no_states() -> None:
     assert table["f_error"][:2].tolist() == [0.012, 0.012]
 
 
-def test_cells_are_formatted_and_dashed_where_there_is_no_number() -> None:
-    table = TABLE.screen("fit")
-    assert list(table) == ["fit", "status", "its error", "R2 of x", "R2 of y"]
-    assert table["its error"].tolist() == ["1.2 %", "-"]
-    assert table["R2 of x"].tolist() == ["0.50", "1.00"]
-
-
-def test_of_several_states_the_first_row_alone_has_what_they_share() -> None:
-    metrics = [METRICS[1], Metric("r2", lambda fit: fit.r2, View.SCREEN, heading="R2")]
-    table = ResultTable(FITS, metrics).screen("fit", by_state=True)
-    assert table.to_dict("list") == {
-        "fit": ["free", "", "coupled", ""],
-        "state": ["x", "y", "x", "y"],
-        "its error": ["1.2 %", "", "-", ""],
-        "R2": [0.5, 0.25, 1.0, 0.0],
-    }
-
-
 def test_json_keeps_states_together_and_headlines_part_them() -> None:
     assert TABLE.json()["free"] == {
         "status": "converged",
@@ -76,20 +56,3 @@ def test_no_records_make_no_rows() -> None:
     assert empty.csv("fit").empty
     assert empty.screen("fit").empty
     assert empty.headline() == {}
-
-
-def test_a_metric_is_taken_of_a_part_of_a_larger_record() -> None:
-    pair = {"first": FITS["free"], "second": FITS["coupled"]}
-    metrics: list[Metric[Mapping[str, Fit]]] = [
-        m.of(lambda p: p["second"], "{}_second") for m in METRICS[:3]
-    ]
-    table = ResultTable({"both": pair}, metrics)
-    assert table.csv()["r2_second_x"].tolist() == [1.0]
-    assert list(table.json()["both"]) == ["status_second", "f_error_second", "r2_second"]
-
-
-@pytest.mark.parametrize(
-    ("value", "text"), [(0.1234, "+12.3 %"), (-0.5, "-50.0 %"), (float("nan"), "-")]
-)
-def test_shares_read_as_percent(value: float, text: str) -> None:
-    assert percent(1, sign=True)(value) == text

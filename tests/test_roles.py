@@ -1,6 +1,5 @@
 """Roles of terms: exact constraints, a search that conserves, mass action, and bad input."""
 
-import re
 from dataclasses import replace
 
 import numpy as np
@@ -106,13 +105,6 @@ def test_a_search_under_roles_finds_the_truth_and_conserves(record):
     assert again.model.terms("n_n")["n_i*n_n"] == -again.model.terms("n_i")["n_i*n_n"]
 
 
-def test_an_inflow_may_be_found(record):
-    roles = ep.Roles(exchange=[("n_n", "n_i")], outflow=STATES, inflow={"n_n": "free"})
-    method = refined(5)
-    found = ep.discover(record, LIBRARY.with_roles(roles), method)
-    assert found.model.terms("n_n")["1"] == pytest.approx(M, rel=1e-3)
-
-
 MASS_ACTION = replace(ROLES, nonnegative=True)
 
 
@@ -133,8 +125,6 @@ def test_mass_action_takes_terms_that_contain_what_they_lower():
         replace(MASS_ACTION, outflow={"n_i": ["n_i", "n_n"]}).processes(LIBRARY, STATES)
     births = replace(MASS_ACTION, inflow={"n_n": ["n_n", "1"]})
     assert [p.term for p in births.processes(LIBRARY, STATES) if p.role == "n_n in"] == ["n_n", "1"]
-    with pytest.raises(ValueError, match="no term of the library may play the role 'n_n out'"):
-        MASS_ACTION.processes(ep.polynomial(["n_i"], degree=2), STATES)
 
 
 def test_a_search_by_mass_action_proposes_positive_processes_alone(record):
@@ -174,24 +164,22 @@ def test_what_is_stated_is_kept_next_to_what_is_found(record):
     ]  # fmt: skip
     assert found.model.terms("n_n")["n_n"] == pytest.approx(-S - B, rel=1e-3)
     assert found.model.terms("n_i")["n_i"] == -A
-    with pytest.raises(ValueError, match="'n_n out' is not known for this record"):
-        roles.with_known({"n_n in": {"1": M}})
-    wrong = replace(ROLES, outflow={"n_i": {"n_n*n_i": 1.0}})
-    with pytest.raises(ValueError, match=r"as the library does, 'n_i\*n_n'"):
-        wrong.processes(LIBRARY, STATES)
 
 
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: ep.Roles(exchange=[("x", "x")]), "joins two states"),
         (lambda: ep.Roles(inflow={"x": "some"}), "must be a number in SI per second, a list"),
         (lambda: ep.Roles(outflow={"x": {"x": "fast"}}), "terms with their coefficients in SI"),
-        (lambda: ep.Roles(exchange=[("x", "y"), ("x", "y")]), r"got \['x to y'\] twice"),
-        (lambda: ep.Roles(outflow=["z"]).processes(LIBRARY, STATES), r"got \['z'\]"),
         (
             lambda: ep.Roles(inflow={"n_n": "known"}).processes(LIBRARY, STATES),
             "known only where a record gives them",
+        ),
+        (
+            lambda: ep.Roles(outflow=["n_i"], equations={"n_i": {"n_i": 1.0}}).processes(
+                LIBRARY, STATES
+            ),
+            "roles or a known equation",
         ),
     ],
 )
@@ -204,9 +192,7 @@ def test_bad_roles_say_what_must_hold(make, message):
     ("options", "message"),
     [
         ({"method": ep.TrajectorySearch(selection=ep.FreeRunScore())}, "keeps roles by likelihood"),
-        ({"method": ep.TrajectorySearch(), "hidden": ["g"]}, "roles need samples of every state"),
         ({"method": ep.Regression()}, "a rule must rank whole systems"),
-        ({"method": refined(1)}, "plays all of the roles"),
     ],
 )  # fmt: skip
 def test_roles_that_cannot_be_kept_are_refused(record, options, message):
@@ -218,20 +204,6 @@ def test_known_or_free_takes_what_there_is():
     either = ep.Roles(inflow={"n_n": "known or free"})
     assert either.with_known({"n_n in": {"1": 2.0}}).inflow == {"n_n": 2.0}
     assert either.with_known({}).inflow == {"n_n": "free"}
-
-
-def test_three_states_exchange_in_pairs():
-    names = ["x", "y", "z"]
-    library = ep.polynomial(names, degree=1)
-    roles = ep.Roles(exchange=[("x", "y"), ("y", "z")], outflow=["z"])
-    chosen = [
-        p for p in roles.processes(library, names)
-        if (p.role, p.term) in {("x to y", "x"), ("y to z", "y"), ("z out", "z")}
-    ]  # fmt: skip
-    held = constraint_of(library, names, chosen)
-    coef = dict(zip(held.coefficients, held.coef(np.array([-2.0, -3.0, -5.0])), strict=True))
-    assert coef == {("x", "x"): -2.0, ("y", "x"): 2.0, ("y", "y"): -3.0, ("z", "y"): 3.0,
-                    ("z", "z"): -5.0}  # fmt: skip
 
 
 def test_a_known_equation_is_kept_and_its_terms_stand_in_no_other() -> None:
@@ -246,18 +218,6 @@ def test_a_known_equation_is_kept_and_its_terms_stand_in_no_other() -> None:
     assert held.coef(np.array([-5.0])).tolist() == [-5.0, -1.0, 2.0]
 
 
-@pytest.mark.parametrize(
-    ("equations", "message"),
-    [
-        ({"n_i": {"n_i": 1.0}}, r"roles or a known equation: \['n_i'\] have both"),
-        ({"n_x": {"n_i": 1.0}}, r"must name states, got \['n_x'\]"),
-    ],
-)
-def test_known_equations_that_make_no_sense_are_refused(equations, message) -> None:
-    with pytest.raises(ValueError, match=message):
-        ep.Roles(outflow=["n_i"], equations=equations).processes(LIBRARY, STATES)
-
-
 def test_the_default_search_keeps_roles():
     """Prey that are born, and eaten by those whom they feed: two equations, three processes."""
     run = ep.lotka_volterra().trajectory(noise=0.05, rng=0)
@@ -269,7 +229,6 @@ def test_the_default_search_keeps_roles():
     }  # fmt: skip
     eaten = -found.model.terms("x")["x*y"]
     assert found.model.terms("y")["x*y"] == pytest.approx(eaten, rel=1e-14)
-    assert re.search(r"x' = 0\.66.* x - 1 .* x y \[", repr(found))
     turned = replace(run, states=run.states * [1.0, -1.0])
     with pytest.raises(ValueError, match="nonnegative roles need states that are concentrations"):
         ep.discover(turned, library.with_roles(roles))

@@ -63,12 +63,6 @@ def test_nothing_is_selected_when_nothing_helps() -> None:
     assert n_selected(ep.Knee(), front_of([1.0, 0.999], 2)) == 0
 
 
-def test_a_score_is_called_by_its_own_name() -> None:
-    """Tables of runs keep their columns."""
-    assert [rule.label for rule in RULES] == ["d_pareto", "d_log", "BIC", "EBIC", "EBIC"]
-    assert BIC.shared_by(6) == BIC
-
-
 def test_the_log_knee_keeps_a_small_term_of_an_exact_law() -> None:
     # The third term lowers the error by 1 % of the whole, but by a factor of a thousand.
     front = front_of([1.0, 0.5, 0.01, 1e-5, 0.9e-5], 10)
@@ -167,12 +161,6 @@ def test_criteria_keep_no_term_that_explains_rounding(
 
 
 @pytest.mark.parametrize("rule", RULES, ids=repr)
-def test_units_of_the_target_change_no_score(rule: Selection) -> None:
-    (plain,), (scaled,) = (rule.decide([noisy_front(scale=s)]).scores for s in (1.0, 1e20))
-    assert scaled == pytest.approx(plain, rel=1e-9)
-
-
-@pytest.mark.parametrize("rule", RULES, ids=repr)
 def test_every_front_has_its_own_scores(rule: Selection) -> None:
     fronts = [noisy_front(seed=seed) for seed in range(2)]
     both = rule.decide(fronts).scores
@@ -194,9 +182,7 @@ def test_supports_are_counted_among_terms_of_no_higher_degree() -> None:
     ("rule", "setting", "message"),
     [
         (ep.EBIC, {"gamma": -1.0}, "gamma must be zero or more, got -1.0"),
-        (ep.EBIC, {"coarsening": 1.0}, "coarsening counts rows, and must be above 1, got 1.0"),
         (ep.Knee, {"n_norm": "libary"}, "'library' or 'max_terms', got 'libary'"),
-        (ep.Knee, {"scale": "ln"}, "scale must be 'linear' or 'log', got 'ln'"),
     ],
 )
 def test_impossible_settings_are_refused(rule: type, setting: dict, message: str) -> None:

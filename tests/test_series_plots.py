@@ -1,21 +1,13 @@
 """Figures of models next to the data: what every panel must hold."""
 
-from unittest.mock import Mock
-
 import numpy as np
 import pytest
 
 import ep2sindy as ep
 from ep2sindy.figures.series import (
     derivative_figure,
-    phase_figure,
-    spectrum_figure,
-    trajectory_figure,
 )
-from ep2sindy.figures.style import OFF_SCALE, find_exits, frame_limits
-from ep2sindy.model.rollout import Rollout
-from ep2sindy.report.report import Report
-from ep2sindy.studies.views import PlotRange, add_figures
+from ep2sindy.figures.style import find_exits, frame_limits
 
 
 @pytest.fixture(scope="module")
@@ -24,33 +16,6 @@ def oscillation() -> ep.Trajectory:
     t = np.linspace(0.0, 16 * np.pi, 801)
     states = np.column_stack([np.cos(t), -np.sin(t)])
     return ep.Trajectory(t, states, ("x", "v"), units={"x": "m", "v": "m/s"})
-
-
-def rolled(t: np.ndarray, states: np.ndarray, *, diverged: bool = False) -> Rollout:
-    names = ("x", "v")[: states.shape[1]]
-    return Rollout(t, states, diverged, "", names, np.empty((len(t), 0)), (), {})
-
-
-def rollouts(run: ep.Trajectory, n: int) -> dict[str, Rollout]:
-    """The data again, each a little larger; the last runs away."""
-    grown = {f"model {k}": rolled(run.t, (1 + 0.1 * k) * run.states) for k in range(n)}
-    away = run.states[:200] * np.exp(run.t[:200, None])
-    return grown | {f"model {n - 1}": rolled(run.t[:200], away, diverged=True)}
-
-
-@pytest.mark.parametrize("n_models", [1, 3, 8])
-def test_every_model_has_a_row_and_every_state_a_column(
-    oscillation: ep.Trajectory, n_models: int
-) -> None:
-    models = rollouts(oscillation, n_models)
-    for figure in (
-        trajectory_figure(oscillation, models, duration_s=20.0),
-        spectrum_figure(oscillation, models, f_max_Hz=1.0),
-    ):
-        assert len(figure.axes) == 2 * n_models
-        names = [ax.get_ylabel() for ax in figure.axes[::2]]
-        assert names[-1] == f"model {n_models - 1}\n(diverges at 12.5 s)"
-        assert all("m" in ax.get_title() for ax in figure.axes[:2])  # units
 
 
 def test_right_hand_sides_stand_in_the_order_of_the_data(oscillation: ep.Trajectory) -> None:
@@ -93,44 +58,3 @@ def test_a_curve_leaves_a_panel_where_it_crosses_the_edge() -> None:
     assert find_exits(np.array([0.0, 1.0]), np.array([9.0, 0.0]), (0.0, 1.0), (0.0, 2.0)) == [
         (0.0, 2.0, 6)  # it begins outside
     ]
-
-
-def test_runs_off_scale_are_marked_and_named_by_what_becomes_of_them(
-    oscillation: ep.Trajectory,
-) -> None:
-    runs = rollouts(oscillation, 2)
-    words = {"model 0": "follows the data", "model 1": "which ended badly"}
-    rows = trajectory_figure(oscillation, runs, duration_s=20.0, statuses=words)
-    plane = phase_figure(oscillation, runs, duration_s=20.0, statuses=words)
-    names = ["model 0\n(follows the data)", "model 1\n(diverges at 12.5 s)"]
-    assert [ax.get_ylabel() for ax in rows.axes[::2]] == names
-    assert [ax.get_title() for ax in plane.axes] == names
-    for figure, panels in ((rows, rows.axes[2:]), (plane, plane.axes[1:])):
-        assert OFF_SCALE in [text.get_text() for text in figure.legends[0].get_texts()]
-        for ax in panels:
-            marks = [line for line in ax.lines if line.get_label() == f"_{OFF_SCALE}"]
-            at_x, at_y = np.array([line.get_xydata()[0] for line in marks]).T  # type: ignore[index]
-            on_edge = [np.isin(at_y, ax.get_ylim()), np.isin(at_x, ax.get_xlim())]
-            assert np.any(on_edge, axis=0).all()
-    kept = rows.axes[0], rows.axes[1], plane.axes[0]
-    assert not any(line.get_label() == f"_{OFF_SCALE}" for ax in kept for line in ax.lines)
-
-
-def test_times_of_a_run_count_from_its_start(oscillation: ep.Trajectory) -> None:
-    late = ep.Trajectory(1e-6 * oscillation.t + 7e-3, oscillation.states, ("x", "v"))
-    runs = {"model": rolled(late.t[:100], 1.2 * late.states[:100], diverged=True)}
-    since = "time since noon"
-    figure = trajectory_figure(late, runs, duration_s=2e-5, since=since)
-    assert figure.axes[0].get_ylabel() == "model\n(diverges at 6.22 µs)"
-    assert {ax.get_xlabel() for ax in figure.axes} == {"time since noon (µs)"}
-    data = figure.axes[0].lines[0].get_xdata()
-    assert data == pytest.approx(oscillation.t[oscillation.t <= 20.0])  # type: ignore[comparison-overlap]
-
-
-def test_one_state_has_no_phase_portrait(oscillation: ep.Trajectory) -> None:
-    one = ep.Trajectory(oscillation.t, oscillation.states[:, :1], ("x",))
-    model = ep.SparseModel(ep.named_terms(("x",), ("x",)), ("x",), np.array([[-1.0]]))
-    integrated = {"model": ep.evaluate(model, one)}
-    report = Mock(Report)
-    add_figures(report, ("phase", "spectra"), one, integrated, PlotRange(20.0, None))
-    assert [call.args[0] for call in report.figure.mock_calls] == ["spectra"]

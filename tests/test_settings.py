@@ -6,28 +6,15 @@ import numpy as np
 import pytest
 
 import ep2sindy as ep
-from ep2sindy.library.relations import relations_of
 
 T = np.linspace(0.0, 3.0, 31)
 X = np.column_stack([np.exp(-T), np.sin(T)])
-RUN = ep.Trajectory(T, X, ["x", "y"])
 LIBRARY = ep.polynomial(["x", "y"], degree=2)
-ROWS = ep.Regression(bootstraps=ep.Bootstraps(n=2))
 
 TEXTS = {
-    "relations": lambda: relations_of("x: x == 1"),
     "the terms of 'x'": lambda: LIBRARY.only({"x": "x*y"}),
-    "the terms of 'x' ": lambda: LIBRARY.exclude({"x": "x*y"}),
-    "the support of 'x'": lambda: ep.library.constraint(LIBRARY, {"x": "x*y"}),
     "products": lambda: ep.polynomial(["x", "y"], degree=1, products="x*y"),
-    "functions": lambda: ep.polynomial(["x", "y"], degree=1, functions="sin"),
-    "variables": lambda: ep.polynomial("xy", degree=1),
-    "names": lambda: ep.named_terms(["x", "y"], "xy"),
-    "states": lambda: ep.discovery.PointSearch("xy", LIBRARY, ROWS),
-    "assessed": lambda: ep.FreeRunScore(assessed="x"),
-    "exact_inputs": lambda: ep.Weak(exact_inputs="u"),
     "state_names": lambda: ep.Trajectory(T, X, "xy"),
-    "input_names": lambda: ep.Trajectory(T, X[:, :1], ["x"], X[:, 1:], "u"),
 }
 
 
@@ -40,24 +27,8 @@ def test_a_text_where_a_list_belongs_is_refused(name: str) -> None:
 
 NO_COUNTS: dict[str, Callable[[object], object]] = {
     "max_terms": lambda n: ep.BestSubset(max_terms=n),
-    "n_best": lambda n: ep.BestSubset(n_best=n),
-    "max_terms ": lambda n: ep.AdaptiveLasso(max_terms=n),
-    "n_thresholds": lambda n: ep.STLSQ(n_thresholds=n),
-    "max_terms   ": lambda n: ep.TrajectorySearch(max_terms=n),
-    "depth": lambda n: ep.TrajectorySearch(depth=n),
-    "depth ": lambda n: ep.Regression(depth=n),
-    "n": lambda n: ep.Bootstraps(n=n),
-    "n_culled": lambda n: ep.Bootstraps(n_culled=n),
-    "block": lambda n: ep.Bootstraps(block=n),
-    "n_blocks": lambda n: ep.regression.BlockSplit(n_blocks=n),
-    "n_steps": lambda n: ep.WeightedWeak(n_steps=n),
     "n_folds": lambda n: ep.FreeRunScore(n_folds=n),
-    "n_starts": lambda n: ep.FreeRunScore(n_starts=n),
-    "n_windows": lambda n: ep.FreeRunScore(n_windows=n),
     "degree": lambda n: ep.polynomial(["x"], degree=n),
-    "function_degree": lambda n: ep.polynomial(
-        ["x"], degree=1, functions=["sin"], function_degree=n
-    ),
 }
 
 
@@ -81,21 +52,11 @@ def test_whole_numbers_of_numpy_are_taken_and_kept_as_they_are_written() -> None
 
 WRONG_KINDS = [
     (lambda: ep.WeightedWeak(weak=ep.Differential()), "weak must be a Weak, such as ep.Weak"),
-    (
-        lambda: ep.Weak(test_functions=ep.regression.Bumps),
-        "test_functions must be a WindowFunctions, such as",
-    ),
-    (
-        lambda: ep.Weak(split=0.25),
-        r"split must be a Split, such as ep.regression.RandomSplit\(\), got 0.25",
-    ),
     (lambda: ep.Differential(smoother="kalman"), "smoother must be a Smoother, such as ep.sig"),
-    (lambda: ep.discovery.PointSearch(["x"], None, ROWS), "library must be a Library, such as"),
     (
         lambda: ep.Regression(selection=ep.discovery.Evidence()),
         "Evidence weighs what a search of trajector",
     ),
-    (lambda: ep.estimate(RUN, None), "library must be a Library, such as ep.polynomial"),
 ]
 
 

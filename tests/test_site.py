@@ -48,11 +48,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     "page",
     [
         "index",
-        "beginners",
         "tutorial",
-        "pysindy",
-        "method",
-        "reference/index",
         "reference/data",
     ],
 )

@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 from scipy.signal import periodogram
 
-from ep2sindy.library.units import Clock
 from ep2sindy.signals import smoothers
 from ep2sindy.signals.smoothers import NoSmoothing, SavitzkyGolay, difference
 from ep2sindy.signals.spectrum import dominant_frequency, power_spectrum
@@ -57,17 +56,10 @@ def test_derivative_converges_at_second_order() -> None:
     assert -np.polyfit(np.log(steps), np.log(errors), 1)[0] == pytest.approx(2.0, abs=0.1)
 
 
-@pytest.mark.parametrize(("window", "order"), [(10, 3), (3, 3), (5, -1)])
+@pytest.mark.parametrize(("window", "order"), [(10, 3), (5, -1)])
 def test_impossible_windows_are_refused(window: int, order: int) -> None:
     with pytest.raises(ValueError, match=f"odd and longer .* window={window}, order={order}"):
         SavitzkyGolay(window=window, order=order)
-
-
-def test_short_trajectories_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"at least 11 samples .* 10"):
-        SavitzkyGolay().smooth(EQUAL[:10], np.ones((10, 1)))
-    with pytest.raises(ValueError, match="three samples or more, got 2"):
-        difference(EQUAL[:2], np.ones((2, 1)))
 
 
 @pytest.mark.parametrize("stretch", [0.0, 1e-4], ids=["equal", "unequal"])
@@ -96,22 +88,3 @@ def test_a_spectrum_is_that_of_scipy(n: int) -> None:
     theirs = periodogram(x, 1e3, window="hann", detrend="constant")
     for ours, other in zip(power_spectrum(t, x), theirs, strict=True):
         np.testing.assert_allclose(ours, other, rtol=1e-10, atol=1e-20)
-
-
-def test_frequencies_read_in_their_own_prefix() -> None:
-    texts = [Clock().frequency_text(f) for f in (14103.0, 0.0531, 2.5e6, 3.0, 0.0, float("nan"))]
-    assert texts == ["14.1 kHz", "53.1 mHz", "2.5 MHz", "3 Hz", "0 Hz", "-"]
-
-
-def test_times_read_in_the_unit_that_a_file_counts_them_in() -> None:
-    year = Clock.of("year")
-    assert year.frequency_text(1.0 / (10.0 * year.seconds)) == "0.1 per year"
-    assert year.duration_text(21.0 * year.seconds) == "21 years"
-    assert year.rate_unit("1") == "year^-1"
-    assert Clock.of("ms") == Clock()  # the second's parts go by prefixes
-    assert Clock.of("1e-06 s") == Clock()
-    assert Clock().duration_text(182e-6) == "182 µs"
-    assert Clock().rate_unit("m^-3") == "m^-3 s^-1"
-    for unit in ("m", "1", "yaer"):
-        with pytest.raises(ValueError, match="a unit of time must be such as"):
-            Clock.of(unit)

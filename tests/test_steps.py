@@ -90,14 +90,6 @@ def check(field: xr.Dataset) -> None:
     np.testing.assert_allclose(field["z"].values, Z, rtol=1e-12, atol=1e-18)
 
 
-def test_particles_whose_number_changes_are_left_out_and_reported(tmp_path: Path) -> None:
-    with h5py.File(tmp_path / "a.h5", "w") as file:
-        for k in range(N):
-            openpmd(file, k)
-    words = ep.inspect_file(tmp_path / "a.h5").source.words
-    assert "left out, not in every step or of changing size: data/particles/e/position/x" in words
-
-
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_a_file_for_each_step_is_joined(
     tmp_path: Path, layout: Callable[[h5py.File, int], None]
@@ -144,15 +136,6 @@ def test_without_time_the_time_of_a_step_is_asked_for(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="a field needs time: give the time of one step"):
         ep.open_field(pattern)
     check(ep.open_field(pattern, dt_s=DT / 100, plasma=True))
-
-
-def test_a_step_of_another_shape_is_named(tmp_path: Path) -> None:
-    pattern = without_time(tmp_path)
-    np.savez(tmp_path / "dump_300.npz", n_i=N_I[0, :4], z=Z)
-    with pytest.raises(
-        ValueError, match=r"one shape in all steps: \(5,\) at step 0, \(4,\) at ste"
-    ):
-        ep.open_field(pattern, dt_s=DT / 100, plasma=True)
 
 
 def test_files_with_times_are_records_of_their_own(tmp_path: Path) -> None:

@@ -35,8 +35,3 @@ def test_noise_is_a_share_of_the_rms() -> None:
     rms = np.sqrt(np.square(clean).mean(axis=0))
     # 3000 samples: the spread of a standard deviation is 1/sqrt(2 n) = 1.3 %.
     assert (noisy - clean).std(axis=0) / rms == pytest.approx(0.05, rel=4 * 0.013)
-
-
-def test_noise_without_a_generator_is_refused() -> None:
-    with pytest.raises(ValueError, match="together with an rng: noise=0.05, rng=None"):
-        ep.lorenz().trajectory(noise=0.05)

@@ -1,7 +1,6 @@
 """What a method is asked: records that agree, a library, and what is known of the equations."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -24,10 +23,6 @@ WRONG = {
         replace(OTHER, units={"x": "m^-3"}),
         r"units must agree: 'x' is in 1 in trajectory 0 and in m\^-3 in trajectory 1; convert",
     ),
-    "order": (
-        replace(OTHER, states=OTHER.states[:, ::-1], state_names=["y", "x"]),
-        r"trajectory 1 has states \['y', 'x'\] and inputs \[\]; give all of them the same states",
-    ),
     "repeated": (RUN, "every sample must come once: 200 samples in a row stand in"),
 }
 
@@ -42,7 +37,6 @@ def test_runs_that_do_not_agree_are_refused_by_every_method(method, wrong: str) 
 
 ASKED = [
     ({"library": LIBRARY.only({"z": ["x"]})}, r"unknown state 'z'; there are \['x', 'y'\]"),
-    ({"runs": []}, "at least one run is needed, got an empty list"),
     ({"library": ep.polynomial(["x", "u"], degree=1)}, r"the library needs \['u'\]: sample it as"),
 ]
 
@@ -129,7 +123,6 @@ def test_a_method_needs_no_more_than_a_rule_and_an_answer() -> None:
     ("value", "lacking"),
     [
         (ep.BestSubset(), "which has no selection and no identify"),
-        (SimpleNamespace(selection=ep.EBIC()), "which has no identify"),
         (ep.Regression, "got the class Regression; call it to make a value$"),
     ],
 )

@@ -57,6 +57,9 @@ def test_on_one_thread_and_then_on_as_many_as_before() -> None:
     with one_thread():
         assert threads() == (1, 1)
     assert threads() == (2, 2)
+    with pytest.raises(ValueError, match="no"), one_thread():
+        raise ValueError("no")
+    assert threads() == (2, 2)
 
 
 def test_the_last_to_leave_gives_the_threads_back() -> None:
@@ -66,12 +69,6 @@ def test_the_last_to_leave_gives_the_threads_back() -> None:
     first.__exit__(None, None, None)
     assert threads()[0] == 1
     second.__exit__(None, None, None)
-    assert threads() == (2, 2)
-
-
-def test_an_error_gives_the_threads_back() -> None:
-    with pytest.raises(ValueError, match="no"), one_thread():
-        raise ValueError("no")
     assert threads() == (2, 2)
 
 

@@ -65,10 +65,7 @@ def test_second_call_reads_identical_values(tmp_path, monkeypatch):
     ("one", "other"),
     [
         ({}, {"initial": ColdStart()}),
-        ({"initial": ColdStart()}, {"initial": ColdStart(n_i=4e17)}),
         ({"initial": SoftStart(hold_s=1e-5)}, {"initial": SoftStart(hold_s=2e-5)}),
-        ({}, {"averaged": False}),
-        ({}, {"thruster": Thruster(series_resistance=2.0)}),
         ({}, {"operating_point": OperatingPoint(300.0, 5.0, neutral_speed=281.0)}),
         ({}, {"n_cells": 41}),
     ],
@@ -100,13 +97,6 @@ def test_interrupted_write_leaves_nothing(tmp_path, monkeypatch):
     assert kept(tmp_path) == []
 
 
-def test_a_cache_that_cannot_be_written_costs_no_simulation(tmp_path, monkeypatch):
-    (tmp_path / "taken").write_text("a file")
-    monkeypatch.setattr(axial, "simulate_as", lambda *_, **__: pytest.fail("simulated in vain"))
-    with pytest.raises(OSError, match="taken could not be written .*make room there"):
-        simulate(Thruster(), POINT, cache=tmp_path / "taken", **BRIEF)
-
-
 def damaged(content: bytes) -> bytes:
     """One byte in the middle of the values changed."""
     middle = len(content) // 2
@@ -123,7 +113,6 @@ def other_parameters(content: bytes) -> bytes:
     [
         (damaged, "cannot be read"),
         (lambda content: content[:-9], "cannot be read"),
-        (lambda content: b"", "cannot be read"),
         (other_parameters, "it is of other parameters"),
     ],
 )
@@ -138,18 +127,6 @@ def test_a_kept_run_that_is_damaged_or_another_is_simulated_again(
     assert len(small_runs) == 2
     printed = capsys.readouterr()
     assert reason in " ".join((printed.out + printed.err).split())
-
-
-def test_a_run_under_the_name_of_another_is_not_taken_for_it(tmp_path, small_runs):
-    hot = OperatingPoint(300.0, 5.0, neutral_speed=281.0)
-    simulate(Thruster(), POINT, cache=tmp_path, **BRIEF)
-    (path,) = tmp_path.iterdir()
-    expected = simulate(Thruster(), hot, cache=tmp_path / "other", **BRIEF)
-    (other,) = (tmp_path / "other").iterdir()
-    other.write_bytes(path.read_bytes())
-    found = simulate(Thruster(), hot, cache=tmp_path / "other", **BRIEF)
-    assert [point for point, _ in small_runs] == [POINT, hot, hot]
-    xr.testing.assert_identical(found.drop_attrs(), expected.drop_attrs())
 
 
 def test_a_cache_that_takes_no_file_costs_no_simulation(tmp_path, monkeypatch):

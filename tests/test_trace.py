@@ -13,7 +13,6 @@ from ep2sindy.discovery.one_signal import (
     run_on_rest,
     try_in_turn,
 )
-from ep2sindy.library.units import Clock
 from ep2sindy.signals.embedding import DROWNED, Embedding, embed_alike, unexplained
 from ep2sindy.signals.smoothers import ratio_bounds
 from ep2sindy.signals.spectrum import dominant_frequency, signal_memory_s
@@ -268,7 +267,6 @@ def test_a_signal_named_as_the_rate_keeps_its_name():
 @pytest.mark.parametrize(
     ("run", "message"),
     [
-        (sine(5.0), r"must hold 6 periods or more: x holds about 5\.0 in [\d.]+ ms; record"),
         (
             recorded(np.arange(2000.0), np.random.default_rng(0).standard_normal(2000)),
             "a trace must oscillate: no period explains a quarter of the variance of x",
@@ -277,20 +275,10 @@ def test_a_signal_named_as_the_rate_keeps_its_name():
             recorded(np.arange(300.0), 2.0 + np.sin(2 * np.pi * np.arange(300.0) / 4.3)),
             r"sampled 6 times a period or more: x has 4\.3 samples .* is aliased",
         ),
-        (recorded(np.arange(500.0), np.exp(-np.arange(500.0) / 100)), "if it oscillates at all"),
     ],
 )
 def test_what_does_not_oscillate_is_refused(run, message):
     with pytest.raises(ValueError, match=message):
-        ep.signals.prepare_signal(run)
-
-
-def test_a_short_record_is_refused_in_its_own_unit_of_time():
-    clock = Clock.of("year")
-    t = np.arange(21.0) * clock.seconds
-    x = np.sin(2.0 * np.pi * np.arange(21.0) / 8.0)
-    run = ep.Trajectory(t, x[:, None], ["x"], clock=clock)
-    with pytest.raises(ValueError, match=r"x holds about [\d.]+ in 20 years"):
         ep.signals.prepare_signal(run)
 
 
@@ -306,16 +294,7 @@ def test_logarithms_of_a_signal_with_zeros_are_refused(mean):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: ep.signals.LogSmoother(0.0), "finest_s must be positive and finite"),
         (lambda: ep.embed(sine(), n_states=6), "n_states must be 2 to 5, got 6"),
-        (lambda: ep.embed(sine(), "lags"), "how must be auto, hidden, rate, derivative, delays"),
-        (lambda: ep.embed(sine(), harmonics=0.5), "harmonics must be one or more, got 0.5"),
-        (lambda: ep.embed(sine(), decimate=0), "decimate must be auto, null or a whole number"),
-        (lambda: ep.signals.prepare_signal(ep.lotka_volterra().trajectory()), "one signal must be"),
-        (
-            lambda: ep.signals.LogSmoother().estimate(np.arange(9.0), -np.ones(9)),
-            "a signal must be positive for its logarithm",
-        ),
         (
             lambda: ep.signals.LogSmoother().estimate(np.arange(5.0), np.ones(5)),
             "at least 8 samples",

@@ -45,31 +45,9 @@ REPEATED[20] = REPEATED[19]
     [
         ({"states": NAN_STATES}, r"x\[12\] = nan at t = 0.244898 s"),
         ({"t": REPEATED}, r"t must increase: t\[20\] = 0.387755102 s follows 0.387755102 s"),
-        ({"t": np.linspace(0, 1, 49)}, r"as many samples as t, got \(50, 1\) with 49 times"),
-        ({"inputs": np.ones((49, 1)), "input_names": ["u"]}, "inputs must have shape"),
-        ({"inputs": np.ones((50, 1))}, "one name per column"),
-        ({"t": np.zeros(1), "states": np.ones((1, 1))}, "at least two samples"),
         ({"states": np.full((50, 1), 2.5)}, "'x' stays at 2.5 over all 50 samples; leave it out"),
-        ({"inputs": np.ones((50, 1)), "input_names": ["x"]}, r"unique, got \['x'\]"),
     ],
 )
 def test_bad_samples_are_refused_by_name(changes: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         wave(**changes)
-
-
-def test_infinite_time_is_refused() -> None:
-    t = np.linspace(0.0, 1.0, 50)
-    t[-1] = np.inf
-    with pytest.raises(ValueError, match=r"t\[49\] = inf"):
-        wave(t=t)
-
-
-def test_unknown_variable_names_what_exists() -> None:
-    with pytest.raises(ValueError, match=r"unknown variable 'Vd'; this trajectory has \['x'\]"):
-        wave().columns(["Vd"])
-
-
-def test_window_outside_the_trajectory_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"\[40, 60\) was asked of 50 samples"):
-        wave().window(40, 60)

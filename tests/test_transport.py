@@ -36,10 +36,7 @@ def test_equal_points_are_the_two_zone_model_without_zones():
     ("build", "message"),
     [
         (lambda: ep.thruster.GaussianTransport(trough=1.5), r"GaussianTransport\.trough must be"),
-        (lambda: ep.thruster.GaussianTransport(center=np.nan), r"center must be finite, got nan"),
         (lambda: ep.thruster.MultiLogTransport([0.0, 0.0], [0.1, 0.1]), r"must increase: 0 follow"),
-        (lambda: ep.thruster.MultiLogTransport([0.0, 1.0], [0.1]), r"c must have one number for"),
-        (lambda: ep.thruster.MultiLogTransport([0.0, 1.0], [0.1, 0.0]), r"positive everywhere"),
     ],
 )
 def test_bad_transport_says_what_must_hold(build, message):

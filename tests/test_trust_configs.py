@@ -14,7 +14,6 @@ from ep2sindy.app.targets import FOR_CONFIGS, check_targets
 from ep2sindy.studies.libraries import registered
 from tests.programs import ended
 
-ROOT = Path(__file__).resolve().parents[1]
 RUNS = "__import__('pathlib').Path('canary_that_sang').touch()"
 # What Hydra would call, what writes or runs what it is given, and what is not for configs.
 REFUSED = [

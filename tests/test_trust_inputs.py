@@ -15,7 +15,6 @@ import ep2sindy as ep
 from ep2sindy.app.compare import read_run
 from ep2sindy.data.mapping import read_array
 from ep2sindy.data.readers.registry import open_source
-from ep2sindy.data.readers.source import damage_named
 from ep2sindy.library.names import split_term
 from ep2sindy.thruster.axial.settings import Settings
 from ep2sindy.trust import memory
@@ -63,16 +62,9 @@ def test_a_damaged_file_is_named(name: str, content: bytes, tmp_path: Path) -> N
 @pytest.mark.parametrize(
     "change",
     [
-        {"states": [1]},
-        {"library": "x"},
         {"library": ["x^9999"]},
-        {"units": [[]]},
-        {"coefficients": [["x"]]},
         {"coef": [[None]]},
-        {"points": []},
         {"covariance": [[1.0, 0.0]]},
-        {"left_out": [0.1, 0.2]},
-        {"left_out": "none"},
         {"format": "ep2sindy.OperatingLaw/2"},
     ],
 )
@@ -92,24 +84,18 @@ RUN = {"summary.json": '{"experiment": "weak", "seed": 1}', "provenance.json": "
 @pytest.mark.parametrize(
     ("name", "content"),
     [
-        ("summary.json", '{"experiment": "weak"}'),
         ("summary.json", '{"experiment": "weak", "seed": 1, "data": {"time_unit": "ages"}}'),
-        ("summary.json", "[" * 100_000),
         ("provenance.json", "[1]"),
         ("config.yaml", "a: &a {b: *a}"),
     ],
 )
 def test_a_damaged_run_folder_is_named(name: str, content: str, tmp_path: Path) -> None:
-    for each, text in (RUN | {name: content}).items():
-        (tmp_path / each).write_text(text)
-    with pytest.raises(ValueError, match=f"{name} cannot be read: "):
-        read_run(tmp_path, 0)
-
-
-def test_a_run_folder_with_little_in_it_is_read(tmp_path: Path) -> None:
     for each, text in RUN.items():
         (tmp_path / each).write_text(text)
     assert read_run(tmp_path, 0).settings == {"seed": 1}
+    (tmp_path / name).write_text(content)
+    with pytest.raises(ValueError, match=f"{name} cannot be read: "):
+        read_run(tmp_path, 0)
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes of POSIX")
@@ -132,23 +118,6 @@ def test_a_circle_of_groups_is_not_walked_twice(tmp_path: Path) -> None:
         file["g/x"] = np.arange(6.0)
         file["g/again"] = file["g"]
     assert "g/x" in open_source(tmp_path / "circle.h5").names
-
-
-@pytest.mark.parametrize(
-    ("error", "stated"),
-    [
-        (AttributeError("'NoneType' object has no attribute 'x'"), "it is damaged, or of another"),
-        (OSError("Unable to open file\n(truncated file: eof = 9)."), "Unable to open file (trunca"),
-    ],
-)
-def test_a_library_speaks_in_one_line_and_python_does_not(
-    error: Exception, stated: str, tmp_path: Path
-) -> None:
-    words = pytest.raises(ValueError, match="a.nc cannot be read: ")
-    with words as caught, damage_named(tmp_path / "a.nc"):
-        raise error
-    assert stated in str(caught.value)
-    assert "\n" not in str(caught.value)
 
 
 class Marks:

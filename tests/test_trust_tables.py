@@ -1,25 +1,16 @@
 """Tables, packed arrays and JSON of other people: read as what they are, or refused by name."""
 
-import io
 import json
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
 import h5py
 import numpy as np
-import pandas as pd
 import pytest
 import xarray as xr
 
 import ep2sindy as ep
-from ep2sindy.app.compare import read_run
 from ep2sindy.data.readers.registry import open_source
-from ep2sindy.data.readers.source import leaves
-from ep2sindy.library.library import named_terms
-from ep2sindy.runtime.files import read_json
-from ep2sindy.thruster.ionization import read_rate_table
-from tests.test_trust_inputs import RUN
 
 X = np.arange(20) * 250.5  # below a thousand, and above
 
@@ -66,14 +57,7 @@ AMBIGUOUS = {
         "t\tx\n" + "".join(f"{k}\t1,{k:03d}\n" for k in range(9)),
         "'1,000' may be 1.000 or 1000, and no number of the file tells which",
     ),
-    "one column of decimal commas, or two": (
-        "x\n1,5\n2,5\n3,5\n", r"it has 1 names, \['x'\], and the rows have 2 columns",
-    ),
-    "a word in the first row": ("t,x\n0,bad\n1,2\n2,4\n", r"the line \['0', 'bad'\] is neither"),
     "a word in the second row": ("t,x\n0,1\n1,bad\n2,4\n3,5\n", "line 3 is '1,bad'"),
-    "words in the first row": (
-        "t,x\nover,load\n1,2\n2,4\n", "may be names: leave one of these lines",
-    ),
     "names that no number helps": (
         "t,x,x,x.1\n" + "0,1,2,3\n" * 5, "must have names of their own: 'x.1' comes more than once",
     ),
@@ -97,8 +81,6 @@ ROWS = "".join(f"{k},{2 * k}\n" for k in range(9))
         ("t,x\ns,A\n", ["t", "x"], ["s", "A"], [0.0, 0.0]),
         ("t,x\nsec,a.u.\n", ["t", "x"], ["sec", ""], [0.0, 0.0]),
         ("t,x\n-1,n/a\n", ["t", "x"], ["", ""], [-1.0, np.nan]),
-        ("run A,run A\nt,x\n", ["t", "x"], ["", ""], [0.0, 0.0]),
-        ("# from a,scope\na,b\n", ["a", "b"], ["", ""], [0.0, 0.0]),
     ],
 )
 def test_units_and_missing_samples_below_a_header_cost_no_name_and_no_row(
@@ -119,37 +101,6 @@ def test_columns_of_one_name_are_numbered_and_none_is_taken_for_the_name(tmp_pat
     assert [each.name for each in found.held] == ["t", "x.0", "x.1"]
     with pytest.raises(ValueError, match=r"no variable 'x' .*it holds t \(9\), x\.0 \(9\), x\.1"):
         ep.open_field(tmp_path / "a.csv", variables={"x": ep.data.Variable("x", "1")}, dt_s=1.0)
-
-
-def test_columns_that_are_left_out_are_reported(tmp_path: Path) -> None:
-    text = "t,x,note,rare\n" + "".join(f"{k},{k},ok,{k if k == 3 else ''}\n" for k in range(9))
-    (tmp_path / "a.csv").write_text(text)
-    assert "left out: note" in open_source(tmp_path / "a.csv").words
-
-
-def test_an_index_and_a_column_of_one_name_are_refused() -> None:
-    frame = pd.DataFrame({"t": [0.0, 1.0], "x": [1.0, 2.0]})
-    with pytest.raises(ValueError, match="columns of a table must have names of their own"):
-        ep.discover(frame.set_index("t", drop=False))
-
-
-def test_arrays_of_one_name_are_refused(tmp_path: Path) -> None:
-    content = io.BytesIO()
-    np.save(content, np.arange(5.0))
-    with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
-        archive.writestr("x.npy", content.getvalue())
-        with pytest.warns(UserWarning, match="Duplicate name"):
-            archive.writestr("x.npy", content.getvalue())
-    with pytest.raises(ValueError, match="a.npz .*names of their own: 'x' comes 2 times"):
-        ep.inspect_file(tmp_path / "a.npz")
-    with pytest.raises(ValueError, match=r"a name must mean one value: 'a\.b' means two"):
-        leaves({"a.b": 1, "a": {"b": 2}})
-
-
-def test_a_row_of_a_rate_table_with_a_word_is_not_dropped(tmp_path: Path) -> None:
-    (tmp_path / "rates.csv").write_text("T (eV),rate\n1,1e-22\n5,bad\n25,6e-14\n")
-    with pytest.raises(ValueError, match=r"rates.csv has a row \['5', 'bad'\]"):
-        read_rate_table(tmp_path / "rates.csv")
 
 
 def written(path: Path, *, time: str = "s", **packing: object) -> Path:
@@ -179,7 +130,6 @@ PLAIN = {"x": ep.data.Variable("x", "1")}
     ("key", "value"),
     [
         ("scale_factor", 0.0),
-        ("scale_factor", "two"), ("scale_factor", np.array([1.0, 2.0])),
         ("add_offset", np.nan),
     ],
 )  # fmt: skip
@@ -210,18 +160,6 @@ def test_days_are_no_seconds(kind: str, time: str, tmp_path: Path) -> None:
         assert field["time"].values[:2].tolist() == [0.0, 86400.0]
 
 
-def test_null_spaces_of_hdf5_are_named(tmp_path: Path) -> None:
-    with h5py.File(tmp_path / "a.h5", "w") as file:
-        file["t"], file["x"], file["n"] = np.arange(5.0), np.arange(5.0), h5py.Empty("f8")
-        file["y"] = np.arange(5.0) ** 2
-        file["x"].attrs["units"] = h5py.Empty("S1")
-        file["y"].attrs["_FillValue"] = h5py.Empty("f8")
-    held = {each.name: each for each in ep.inspect_file(tmp_path / "a.h5").held}
-    assert "'/n' is empty: its dataspace is null" in held["n"].problem
-    assert "_FillValue of 'y' must be a number: the attribute is empty" in held["y"].problem
-    assert (held["x"].unit, held["x"].problem) == ("", "")
-
-
 def test_a_table_of_thousands_of_columns_is_read(tmp_path: Path) -> None:
     n = 3000
     names = ",".join(f"c{k}" for k in range(n))
@@ -230,40 +168,16 @@ def test_a_table_of_thousands_of_columns_is_read(tmp_path: Path) -> None:
     assert open_source(tmp_path / "a.csv").read("c2999").values.tolist() == [2999.5] * 4
 
 
-def test_exponents_of_a_model_are_counted_first() -> None:
-    """8000 terms of 8000 variables took 2 GiB."""
-    names = [f"v{k}" for k in range(8000)]
-    for variables, terms in ((names, names), (["x"], [f"sin({k}*x)" for k in range(2, 8002)])):
-        with pytest.raises(
-            ValueError, match="may have up to 4 million exponents.*, got 8000 terms of"
-        ):
-            named_terms(variables, terms)
-    assert len(named_terms(names[:1000], names[:1000])) == 1000
-
-
-TWICE = '{"a": 1, "b": {"c": 1, "c": 2}}'
-
-
-def test_a_key_that_comes_twice_is_refused(tmp_path: Path) -> None:
-    assert read_json('{"a": {"c": 1}, "b": {"c": 2}}') == {"a": {"c": 1}, "b": {"c": 2}}
-    with pytest.raises(ValueError, match="must have each key once: 'c' comes 2 times"):
-        read_json(TWICE)
-
-
 def twice(text: str, key: str) -> str:
     return text.replace(f'"{key}":', f'"{key}": [], "{key}":', 1)
 
 
-def test_it_is_refused_in_models_runs_inputs_and_records(tmp_path: Path) -> None:
+def test_a_key_that_comes_twice_is_refused_in_models_and_records(tmp_path: Path) -> None:
     model = tmp_path / "model.json"
     model.write_text(twice(ep.lorenz().model.to_json(), "states"))
-    with pytest.raises(ValueError, match="model.json: .* each key once: 'states' comes 2 times"):
+    with pytest.raises(ValueError, match="each key once: 'states'"):
         ep.SparseModel.load(model)
-    for name, text in (RUN | {"summary.json": twice(RUN["summary.json"], "seed")}).items():
-        (tmp_path / name).write_text(text)
-    with pytest.raises(ValueError, match="summary.json cannot be read: .*each key once: 'seed'"):
-        read_run(tmp_path, 0)
     record = tmp_path / "a.json"
     record.write_text(twice(json.dumps({"config": {}, "t": [0, 1], "x": [1, 2]}), "t"))
-    with pytest.raises(ValueError, match="a.json .*each key once: 't' comes 2 times"):
+    with pytest.raises(ValueError, match="each key once: 't'"):
         ep.inspect_file(record)

@@ -65,7 +65,6 @@ def test_shares_change_at_the_exit_or_across_a_layer():
 @pytest.mark.parametrize(
     ("build", "message"),
     [
-        (lambda: ep.thruster.wall_material("glass"), r"there are walls of \['BN-SiO2', .*"),
         (lambda: ep.thruster.SheathWall(yield_0=1.0), r"SheathWall\.yield_0 must be below 1"),
     ],
 )

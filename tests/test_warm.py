@@ -6,8 +6,6 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from shutil import copytree
-from types import SimpleNamespace
 
 import pytest
 
@@ -60,20 +58,15 @@ def test_what_kernels_import_compiles_them_again_too() -> None:
 
 CALL = """
 import sys
-from pathlib import Path
-from ep2sindy.runtime import compilation
 sys.path.insert(0, sys.argv[1])
-compilation.SHARED = Path(sys.argv[2])
 import my_kernels
 """
 
 
-def called(
-    folder: Path, *, shared: Path = Path("/none"), **environment: str
-) -> subprocess.CompletedProcess[str]:
+def called(folder: Path, **environment: str) -> subprocess.CompletedProcess[str]:
     """Run a kernel that calls another, by a process of its own."""
     return subprocess.run(
-        [sys.executable, "-c", CALL, str(folder), str(shared)],
+        [sys.executable, "-c", CALL, str(folder)],
         env=os.environ | environment, capture_output=True, text=True, check=True,
     )  # fmt: skip
 
@@ -94,41 +87,16 @@ def kernels(tmp_path: Path) -> Path:
 def test_a_kernel_is_kept_where_one_may_write_and_follows_what_it_calls(
     kernels: Path, tmp_path: Path
 ) -> None:
-    cache, shared = str(tmp_path / "cache"), tmp_path / "shared"
+    cache = str(tmp_path / "cache")
     first = called(kernels, EP2SINDY_CACHE=cache)
     assert (first.stdout, first.stderr) == ("5.0\n", f"{compilation.ANNOUNCEMENT}\n")
     assert list((tmp_path / "cache" / "kernels").rglob("*.nbi"))
-    # As in a container, whose image an administrator has warmed.
-    copytree(tmp_path / "cache" / "kernels", shared)
-    for settings in ({"EP2SINDY_CACHE": cache}, {"EP2SINDY_CACHE": "/dev/null", "shared": shared}):
-        again = called(kernels, **settings)
-        assert (again.stdout, again.stderr) == ("5.0\n", "")
+    again = called(kernels, EP2SINDY_CACHE=cache)
+    assert (again.stdout, again.stderr) == ("5.0\n", "")
     inner = kernels / "inner.py"
     inner.write_text(inner.read_text().replace("x + 1.0", "x + 1.25"))
     assert called(kernels, EP2SINDY_CACHE=cache).stdout == "5.5\n"
     assert not list(kernels.rglob("*.nbi"))
-
-
-@pytest.mark.usefixtures("compilations")
-def test_an_administrator_puts_kernels_next_to_the_package(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    made, lacking = tmp_path / "cache" / "kernels" / "model_1", tmp_path / "none"
-    made.mkdir(parents=True)
-    (made / "a.nbi").write_text("index")
-    monkeypatch.setattr(precompile, "folders", lambda: [made, lacking])
-    monkeypatch.setattr(precompile, "SHARED", tmp_path / "shared")
-    for _ in range(2):
-        precompile.main(["--shared"])
-        stamp, kernel = sorted((tmp_path / "shared").iterdir(), reverse=True)
-        assert stamp.name.startswith("warm_")
-        assert (kernel / "a.nbi").read_text() == "index"
-
-
-def test_without_a_folder_kernels_are_compiled_every_time_and_it_is_reported(kernels: Path) -> None:
-    run = called(kernels, EP2SINDY_CACHE="/dev/null")
-    assert run.stdout == "5.0\n"
-    assert run.stderr.count("they are not kept, for") == 1
 
 
 def test_what_was_broken_off_is_taken_up_again(compilations: list[bool]) -> None:
@@ -146,15 +114,6 @@ def test_a_folder_that_cannot_be_written_costs_no_run(
     assert len(compilations) == 3
     with pytest.raises(SystemExit, match="error: .*cannot be a cache: "):
         precompile.main([])
-
-
-def test_a_call_that_compiles_says_so_once(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(compilation, "_ANNOUNCED", [])
-    for _ in range(3):
-        compilation._Listener().on_start(SimpleNamespace(data={}))
-    assert capsys.readouterr().err == f"{compilation.ANNOUNCEMENT}\n"
 
 
 @pytest.mark.parametrize("part", precompile.PARTS)

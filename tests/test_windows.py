@@ -154,9 +154,7 @@ def test_the_automatic_width_fits_short_records(n_samples: int) -> None:
     ("build", "message"),
     [
         (lambda: Bumps(half_width_s=0.0), "half_width_s must be positive, got 0.0"),
-        (lambda: Bumps(tau_hat=0.0), "tau_hat must be positive and overlap at least 1"),
         (lambda: Boxes(n_points=1), "n_points must be a whole number, two or more, got 1"),
-        (lambda: Boxes(n_windows=0), "n_windows must be a whole number, one or more, got 0"),
     ],
 )
 def test_impossible_settings_are_refused(build: object, message: str) -> None:
@@ -168,7 +166,6 @@ def test_impossible_settings_are_refused(build: object, message: str) -> None:
     ("functions", "message"),
     [
         (Bumps(half_width_s=1.1), "441 samples were asked of 401; lower half_width_s"),
-        (Bumps(half_width_s=7e-3), "must span two steps or more, got 0.007 s with steps of 0.005"),
         (Boxes(n_points=402), "402 samples were asked of 401; lower n_points or use more data"),
     ],
 )

@@ -202,30 +202,14 @@ def batch_of(run: ep.Trajectory, *, n_windows: int = 3, window: int = 50) -> Win
     )
 
 
-def test_models_of_different_terms_refined_together_are_those_refined_alone() -> None:
+def test_paths_of_several_models_are_smoothed_as_each_by_itself() -> None:
     run = PREY.trajectory(noise=0.05, rng=np.random.default_rng(0))
-    batch = batch_of(run, n_windows=4, window=100)
+    batch, method = batch_of(run, n_windows=4, window=100), MultipleShooting()
+    wider = [{"1": 0.1, "x": 0.5, "x*y": -0.9, "x^2": 0.01}, {"y": -0.3, "x*y": 0.9}]
     library = PREY.model.library
-    given: list[list[Terms]] = [
-        [{"x": 0.6, "x*y": -0.9}, {"y": -0.3, "x*y": 0.9}],
-        [{"1": 0.1, "x": 0.5, "x*y": -0.9, "x^2": 0.01}, {"y": -0.3, "x*y": 0.9, "y^2": 0.01}],
-        [{"x": 0.6, "x*y": -0.9}, {"1": 0.01, "y": -0.3, "x*y": 0.9}],
-    ]
-    models = [
-        ep.SparseModel(library, ["x", "y"], ep.model.coef_matrix(library, terms)) for terms in given
-    ]
-    method = MultipleShooting()
-    found = refine_batch(models, batch, method=method)
-    together = found.models
-    alone = refine_batch(models, batch, method=method, points_per_batch=1).models
-    assert found.finished[0]
-    assert found.loss[0] == pytest.approx(0.05**2 * 2.0, rel=0.5)
-    for one, other, before in zip(together, alone, models, strict=True):
-        np.testing.assert_allclose(one.coef, other.coef, rtol=1e-6)
-        assert ((one.coef != 0.0) == (before.coef != 0.0)).all()
-    assert not np.allclose(together[1].coef, models[1].coef, rtol=1e-3)
-    paths = smooth_batch(together, batch, method=method)
-    for k, model in enumerate(together):
+    models = [PREY.model, ep.SparseModel(library, ["x", "y"], ep.model.coef_matrix(library, wider))]
+    paths = smooth_batch(models, batch, method=method)
+    for k, model in enumerate(models):
         (path,) = smooth_batch([model], batch, method=method)
         np.testing.assert_allclose(paths[k], path, rtol=1e-8, equal_nan=True)
     # A fit of the starts alone is one of the noise alone, where the model is right.
@@ -267,14 +251,3 @@ def test_a_refinement_that_ends_worse_than_it_began_is_not_kept() -> None:
     np.testing.assert_array_equal(
         spoilt, measure.assess([trial, trial], same, batch, fold, SILENT)[1]
     )
-
-
-def test_what_cannot_be_assessed_is_refused() -> None:
-    run = PREY.trajectory()
-    choices = {s: [PREY.model.terms(s)] for s in PREY.model.states}
-    fronts = fronts_of([run], PREY.model.library, choices)
-    with pytest.raises(ValueError, match=r"every state needs one front, got \['x'\]"):
-        scores_by(RULE, fronts[:1])
-    short = fronts_of([run.window(0, 9)], PREY.model.library, choices)
-    with pytest.raises(ValueError, match="5 samples or more, got at most 9; use longer records"):
-        scores_by(RULE, short)

@@ -228,8 +228,9 @@ def chosen(problem: EstimationProblem, found: Solution) -> list[bool]:
     return (coef != 0.0).tolist()
 
 
-def test_eight_waves_of_360_coefficients_are_found() -> None:
-    system = waves(8)
+@pytest.mark.parametrize("n", [6, pytest.param(8, marks=pytest.mark.slow)])
+def test_waves_of_hundreds_of_coefficients_are_found(n: int) -> None:
+    system = waves(n)
     run = system.trajectory(noise=0.05, rng=1)
     found = ep.estimate(run, ep.polynomial(run.state_names, degree=2))
     assert not found.lack_of_fit

@@ -18,15 +18,7 @@ import numpy as np
 import ep2sindy as ep
 from ep2sindy.model.many import WindowSteps, run_many
 from ep2sindy.model.vector_field import VectorField
-from ep2sindy.runtime.compilation import (
-    ANNOUNCEMENT,
-    SHARED,
-    announce_once,
-    copied,
-    digest,
-    folders,
-    sources,
-)
+from ep2sindy.runtime.compilation import ANNOUNCEMENT, announce_once, digest, sources
 from ep2sindy.runtime.parallel import Loky
 from ep2sindy.runtime.progress import Bars
 from ep2sindy.runtime.screen import say
@@ -38,21 +30,12 @@ Runs of the command line do so by themselves; in Python, a call compiles what it
 
 def main(arguments: Sequence[str]) -> None:
     """Compile, and report where the kernels are kept."""
-    parser = argparse.ArgumentParser("ep2sindy precompile", description=ABOUT)
-    parser.add_argument(
-        "--shared", action="store_true", help="keep them next to the package, for all users"
-    )
-    given = parser.parse_args(arguments)
+    argparse.ArgumentParser("ep2sindy precompile", description=ABOUT).parse_args(arguments)
     try:
-        stamp = _stamp()
+        place = _stamp().parent
         precompile()
-        if given.shared:
-            SHARED.mkdir(parents=True, exist_ok=True)
-            for folder in filter(Path.exists, (*folders(), stamp)):
-                copied(folder, SHARED / folder.name)
     except OSError as error:
         sys.exit(f"error: {error}")
-    place = SHARED if given.shared else stamp.parent
     say(f"all kernels are compiled; they are kept in {place}")
 
 
@@ -62,7 +45,7 @@ def precompile() -> None:
         stamp = _stamp()
     except OSError:  # every process compiles what it uses, and says so
         return
-    if stamp.exists() or (SHARED / stamp.name).exists():
+    if stamp.exists():
         return
     say(ANNOUNCEMENT, error=True)
     with suppress(OSError):  # on a full disk, the next run repeats this half minute

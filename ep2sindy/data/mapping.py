@@ -40,12 +40,17 @@ PART = re.compile(r"(.+?)\s*\[([\d:,\s-]+)\]")
 class Variable:
     """Location and unit of one quantity in a file.
 
-    name: name in the file. It may be a path in HDF5 ("group/n_i"), a struct field in MATLAB
-        ("data.n_i"), a column's number in a table ("2") or part of an array ("probe[:, 1]"); both
-        count from 0. None: the file does not hold the quantity.
-    unit: unit of the numbers in the file: "cm^-3", "km/s", "degC"; with a factor, "1e19 m^-3".
-    dims: dimensions in the file's order, such as ("r", "z", "time"). None: as the file names
-        them, or else the only order that fits the lengths.
+    Parameters
+    ----------
+    name : str or None
+        Name in the file. It may be a path in HDF5 ("group/n_i"), a struct field in MATLAB
+        ("data.n_i"), the number of a column in a table ("2"), or part of an array ("probe[:, 1]");
+        both count from 0. None means that the file does not hold the quantity.
+    unit : str
+        Unit of the numbers in the file: "cm^-3", "km/s", "degC"; with a factor, "1e19 m^-3".
+    dims : sequence of str, optional
+        Dimensions in the file's order, such as ("r", "z", "time"). None takes the names in the
+        file, or else the only order that fits the lengths.
     """
 
     name: str | None

@@ -51,25 +51,56 @@ def open_field(
     plasma: bool = False,
     chunks: Mapping[str, int] | None = None,
 ) -> xr.Dataset:
-    """Open a file as a field, with our names, dimensions and units.
+    """Open a file as a field with the package's names, dimensions and units.
 
-    path: a file of any kind in docs/data.md; of a code that writes a file per step, a pattern such
-        as `dump_*.h5`, or a list. Steps are joined along time, those in groups of one file too.
-    variables: our name -> location in the file, as a `Variable` or the same keys from a config;
-        those with name None are left out. None: all that `ep2sindy.inspect_file` is sure of.
-    time, z, r: the coordinates; None, or name None, if the file has none.
-    dt_s: time step in s, taken instead of `time`; of a run in numbered steps, the time of one.
-    mask: array that is nonzero where there is plasma; elsewhere values become NaN.
-    channel_m: length of the channel from z = 0, stored as an attribute; None: as in the file.
-    units: our name -> unit, where the file states none. plasma: names such as Te are a plasma's
-        quantities without a unit, too, and what has no unit is in SI. Both without `variables`.
-    chunks: our dimension -> length, to stream data that exceed memory (needs dask).
-    Large variables of NetCDF, Zarr, HDF5 and MATLAB 7.3 are read when they are used, and a zone is
-    averaged over parts of them; without dask, a mask reads them. Other kinds are read at once.
-    Warns with `DoubtfulUnit` if dt_s contradicts the file's times.
-    Raises one ValueError for all names not in the file, shapes that do not fit their dimensions,
-    and units that cannot be converted; also for a missing or damaged file, or one of another kind.
+    The file may be of any kind listed in docs/data.md. Large variables of NetCDF, Zarr, HDF5 and
+    MATLAB 7.3 files are read when they are used, and a zone is averaged over parts of them; with a
+    mask they are read at once unless dask is installed. Other kinds of files are read at once.
 
+    Parameters
+    ----------
+    path : str, Path or sequence of these
+        The file. If a code writes one file per step, a pattern such as `dump_*.h5`, or a list of
+        files. Steps are joined along time, also if one file holds them as groups.
+    variables : mapping of str to Variable or keys, optional
+        The package's name of each variable and its location in the file, as a `Variable` or as the
+        same keys from a config. Those with name None are left out. None takes all variables that
+        `inspect_file` recognises without doubt.
+    time, z, r : Variable or keys, optional
+        The coordinates. None, or a `Variable` with name None, means that the file has none.
+    dt_s : float, optional
+        Time step in s, used in place of `time`. For a run in numbered steps it is the time of one
+        step.
+    mask : Variable or keys, optional
+        Array that is nonzero where there is plasma. Values elsewhere become NaN.
+    channel_m : float, optional
+        Length of the channel from z = 0, in m, stored as an attribute. None keeps the file's own.
+    units : mapping of str to str, optional
+        Unit by name where the file states none. Only without `variables`.
+    plasma : bool, default False
+        True if names such as Te mean a plasma's quantities even without a unit, and numbers without
+        a unit are in SI. Only without `variables`.
+    chunks : mapping of str to int, optional
+        Length by dimension, to stream data that exceed memory (needs dask).
+
+    Returns
+    -------
+    Dataset
+        The field over those of time, z and r that the file has, in SI.
+
+    Raises
+    ------
+    ValueError
+        If names are not in the file (one error lists all of them), shapes do not fit their
+        dimensions, units cannot be converted, or the file is missing, damaged or of another kind.
+
+    Warns
+    -----
+    DoubtfulUnit
+        If `dt_s` contradicts the times in the file.
+
+    Examples
+    --------
     >>> field = ep.open_field("run.nc")  # its names, units and shapes leave no doubt
     >>> field["n_i"].attrs["units"]
     'm^-3'
@@ -96,13 +127,30 @@ def open_field(
 def inspect_file(path: str | Path | Sequence[str | Path], *, plasma: bool = False) -> Inspection:
     """List the arrays of a file and recognise quantities by names, units and shapes.
 
-    path: a file, or a pattern or a list of the files of the steps of one run. plasma: names such as
-    Te mean quantities where the file states no unit, too, and what has no unit is in SI.
-    Reads every array once. The result prints as a table, followed by notes on what must be given
-    and on missing information. `ep2sindy.open_field(path, variables=found.variables,
-    time=found.time, z=found.z, r=found.r, dt_s=found.dt_s)` opens the recognised field.
-    Raises ValueError for a file that is missing, empty, damaged or of an unknown kind.
+    Every array is read once. The result prints as a table, followed by notes on what you must state
+    and on missing information. `ep.open_field(path, variables=found.variables, time=found.time,
+    z=found.z, r=found.r, dt_s=found.dt_s)` opens the recognised field.
 
+    Parameters
+    ----------
+    path : str, Path or sequence of these
+        The file, or a pattern or a list of the files of the steps of one run.
+    plasma : bool, default False
+        True if names such as Te mean a plasma's quantities even without a unit, and numbers without
+        a unit are in SI.
+
+    Returns
+    -------
+    Inspection
+        The arrays, the recognised variables and coordinates, and the open questions.
+
+    Raises
+    ------
+    ValueError
+        If the file is missing, empty, damaged or of an unknown kind.
+
+    Examples
+    --------
     >>> found = ep.inspect_file("run.nc")
     >>> found.variables["n_i"].unit
     'm^-3'
@@ -144,7 +192,7 @@ def _field(
 ) -> xr.Dataset:
     """Build the field that a mapping describes; one error reports all faults of the mapping."""
     if chunks is not None and find_spec("dask") is None:
-        raise ValueError("data.chunks needs dask: pip install 'ep2sindy[cluster]'")
+        raise ValueError("data.chunks needs dask: pip install 'ep2sindy[files]'")
     arrays: dict[str, xr.DataArray] = {}
     wanted = in_file(variables, problems)
     if not wanted and not problems.found:
@@ -197,7 +245,18 @@ def write_field(field: xr.Dataset, path: str | Path) -> None:
     """Write a field as NetCDF; the file appears under its name only once it is complete.
 
     The file is built in memory, which must be large enough.
-    Raises OSError if it cannot be written.
+
+    Parameters
+    ----------
+    field : Dataset
+        Field over time and z, r or both.
+    path : str or Path
+        The file to write.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written.
     """
     check_field(field)
     if Path(path).suffix != ".nc":
@@ -206,7 +265,18 @@ def write_field(field: xr.Dataset, path: str | Path) -> None:
 
 
 def read_field(path: str | Path) -> xr.Dataset:
-    """Open a field that `write_field` wrote; values are read when they are used."""
+    """Open a field that `write_field` wrote.
+
+    Parameters
+    ----------
+    path : str or Path
+        The NetCDF file.
+
+    Returns
+    -------
+    Dataset
+        The field. Its values are read when they are used.
+    """
     if reader_of(Path(path)) is not NETCDF:
         raise ValueError(f"a written field is NetCDF: {path} is not; open others with open_field")
     with damage_named(Path(path)):

@@ -56,13 +56,30 @@ FUNCTIONS: Mapping[str, Callable] = {"abs": np.abs, "exp": np.exp, "log": np.log
 
 
 def derive(field: xr.Dataset, *, name: str, expression: str, units: str) -> xr.Dataset:
-    """Add the variable `name`, computed from others: "n_i*u_iz", "sqrt(u_iz^2 + u_ir^2)".
+    """Add a variable computed from others, such as "sqrt(u_iz^2 + u_ir^2)".
 
-    expression: may use the operators + - * / ^ and the functions abs, exp, log, sqrt. Its names
-    are the field's variables and coordinates (time, z, r), all in SI or the unit of their suffix.
-    units: unit of the result. Computed in float64.
-    Raises ValueError for an unknown name in the expression, a new name that is already taken, or
-    any other syntax.
+    Parameters
+    ----------
+    field : Dataset
+        Field over time.
+    name : str
+        Name of the new variable.
+    expression : str
+        Formula with the operators + - * / ^ and the functions abs, exp, log, sqrt. Its names are
+        the field's variables and coordinates (time, z, r), all in SI or the unit of their suffix.
+    units : str
+        Unit of the result.
+
+    Returns
+    -------
+    Dataset
+        The field with the new variable, computed in float64.
+
+    Raises
+    ------
+    ValueError
+        If a name in the expression is unknown, the new name is already taken, or the syntax is
+        another.
     """
     check_new(field, name)
     array = evaluate(field, expression)
@@ -74,19 +91,42 @@ def derive(field: xr.Dataset, *, name: str, expression: str, units: str) -> xr.D
 
 
 def gradient(field: xr.Dataset, *, of: str, name: str, axis: str = "z") -> xr.Dataset:
-    """Add the variable `name`, the derivative along z or r of a variable or a product of variables.
+    """Add the derivative along z or r of a variable, or of a product of variables.
 
-    of: such as "n_n", or "n_i*u_iz" for the flux of ions. If the record has that product at the
-    faces between its cells (attribute `face_average_of`, with the lengths `dz` of the cells, as in
-    the axial simulator's averages), the difference of a cell's two faces is taken: the divergence
-    that moved the simulator's density. The last cell, whose far face is not recorded, is then NaN.
-    Otherwise differences over the neighbouring cells are taken, of second order on uneven grids,
-    from the record's time average of the product (attribute `average_of`) if it has one; they are
-    one-sided at the ends, and NaN next to a masked cell. Computed in float64.
-    It is the slope alone: the divergence of a radial flux q in a cylinder is (1/r) d(r q)/dr, and
-    that of an axial one through a cross-section A that widens is (1/A) d(A q)/dz.
-    Raises ValueError for an axis that the field or the variables lack, a single cell, an unknown
-    variable, or a name that is taken.
+    If the record has the product at the faces between its cells (attribute `face_average_of`, with
+    the lengths `dz` of the cells, as in the averages of the axial simulator), the difference of a
+    cell's two faces is taken: the divergence that moved the simulator's density. The last cell,
+    whose far face is not recorded, is then NaN. Otherwise differences over the neighbouring cells
+    are taken, of second order on uneven grids, from the record's time average of the product
+    (attribute `average_of`) if it has one. They are one-sided at the ends, and NaN next to a masked
+    cell.
+
+    Parameters
+    ----------
+    field : Dataset
+        Field over time and the axis.
+    of : str
+        The variable, such as "n_n", or a product, such as "n_i*u_iz" for the flux of ions.
+    name : str
+        Name of the new variable.
+    axis : str, default 'z'
+        "z" or "r".
+
+    Returns
+    -------
+    Dataset
+        The field with the derivative, computed in float64.
+
+    Raises
+    ------
+    ValueError
+        If the field or the variables lack the axis, there is a single cell, a variable is unknown,
+        or the name is taken.
+
+    Notes
+    -----
+    The result is only the slope: the divergence of a radial flux q in a cylinder is (1/r) d(r
+    q)/dr, and that of an axial one through a cross-section A that widens is (1/A) d(A q)/dz.
     """
     check_new(field, name)
     _check_axis(field, axis, f"a gradient along {axis!r}")
@@ -139,9 +179,25 @@ def _touching(field: xr.Dataset) -> xr.DataArray:
 def radial_from_middle(field: xr.Dataset, *, middle_m: float | None = None) -> xr.Dataset:
     """Flip the sign of u_ir below mid radius, so that positive points away from it on both sides.
 
-    Equations that are alike on both sides then get coefficients of the same sign, and maps of the
-    coefficients become symmetric. middle_m: mid radius in m; None: the middle of the grid.
-    Raises ValueError for a field without u_ir on r.
+    Equations that are equal on both sides then get coefficients of the same sign, and maps of the
+    coefficients become symmetric.
+
+    Parameters
+    ----------
+    field : Dataset
+        Field with u_ir over r.
+    middle_m : float, optional
+        Mid radius in m. None takes the middle of the grid.
+
+    Returns
+    -------
+    Dataset
+        The field with the new signs.
+
+    Raises
+    ------
+    ValueError
+        If the field has no u_ir over r.
     """
     if "u_ir" not in field or "r" not in field["u_ir"].dims:
         raise ValueError(
@@ -158,11 +214,21 @@ def radial_from_middle(field: xr.Dataset, *, middle_m: float | None = None) -> x
 
 
 def keep_where(field: xr.Dataset, *, condition: str) -> xr.Dataset:
-    """Mask the cells where `condition` does not hold, such as the inside of a wall.
+    """Mask the cells where a condition does not hold, such as the inside of a wall.
 
-    condition: expression as in `derive`, with bracketed comparisons joined by & and |:
-    "(z > 0.025) | ((r > 0.035) & (r < 0.05))". Variables that lack a dimension of the condition
-    stay as they are.
+    Parameters
+    ----------
+    field : Dataset
+        Field over time and z, r or both.
+    condition : str
+        Expression as in `derive`, with bracketed comparisons joined by & and |, such as
+        "(z > 0.025) | ((r > 0.035) & (r < 0.05))".
+
+    Returns
+    -------
+    Dataset
+        The field with NaN where the condition does not hold. Variables that lack a dimension of the
+        condition stay as they are.
     """
     inside = evaluate(field, condition)
     if inside.dtype != bool or not set(inside.dims) & set(SPACE) or "time" in inside.dims:
@@ -218,7 +284,22 @@ def _value(node: ast.expr, field: xr.Dataset) -> xr.DataArray:
 def crop(
     field: xr.Dataset, *, start_s: float | None = None, stop_s: float | None = None
 ) -> xr.Dataset:
-    """Keep the samples from `start_s` to `stop_s`, both included; None: the end of the record."""
+    """Keep the samples from `start_s` to `stop_s`, both included.
+
+    Parameters
+    ----------
+    field : Dataset
+        Field over time.
+    start_s : float, optional
+        First time in s. None takes the beginning of the record.
+    stop_s : float, optional
+        Last time in s. None takes the end of the record.
+
+    Returns
+    -------
+    Dataset
+        The shorter field.
+    """
     t = grid_points(field, "time")
     start = t[0] if start_s is None else start_s
     stop = t[-1] if stop_s is None else stop_s
@@ -236,6 +317,18 @@ def decimate(field: xr.Dataset, *, factor: int) -> xr.Dataset:
 
     This is plain subsampling: oscillations faster than half the new sampling rate are aliased to
     lower frequencies. Apply `low_pass` with a cutoff below half the new rate first.
+
+    Parameters
+    ----------
+    field : Dataset
+        Field over time.
+    factor : int
+        One sample is kept in so many.
+
+    Returns
+    -------
+    Dataset
+        The shorter field.
     """
     n_samples = field.sizes["time"]
     if factor < 1 or n_samples <= factor:
@@ -249,11 +342,29 @@ def decimate(field: xr.Dataset, *, factor: int) -> xr.Dataset:
 def low_pass(field: xr.Dataset, *, cutoff_Hz: float, order: int = 4) -> xr.Dataset:
     """Remove oscillations faster than `cutoff_Hz` without shifting phases.
 
-    A Butterworth filter of the given order runs forwards and backwards: amplitudes halve at
-    the cutoff and fall by 12 * order dB per octave above it. Variables without time and masked
-    cells stay as they are. Loads the field.
-    Raises ValueError for unequal time steps (beyond 1e-3 of a step), a cutoff not between 0
-    and half the sampling rate, or a record shorter than the filter's edges.
+    A Butterworth filter runs forwards and backwards: amplitudes halve at the cutoff and fall by 12
+    order dB per octave above it. Variables without time and masked cells stay as they are. The
+    field is loaded.
+
+    Parameters
+    ----------
+    field : Dataset
+        Field over time, at equal steps.
+    cutoff_Hz : float
+        Frequency at which amplitudes halve.
+    order : int, default 4
+        Order of the filter.
+
+    Returns
+    -------
+    Dataset
+        The filtered field.
+
+    Raises
+    ------
+    ValueError
+        If time steps are unequal (beyond 1e-3 of a step), the cutoff does not lie between 0 and
+        half the sampling rate, or the record is shorter than the edges of the filter.
     """
     dt_s = _uniform_step(field)
     n_edge = 3 * (order + 1)
@@ -290,12 +401,28 @@ def _uniform_step(field: xr.Dataset) -> float:
 
 
 def resample(field: xr.Dataset, *, dt_s: float) -> xr.Dataset:
-    """Resample the field to equal time steps of `dt_s`.
+    """Resample the field to equal time steps.
 
     If `dt_s` is at most the median step, cubic splines through the samples are evaluated from the
     first sample on. If it is longer, each new sample is the mean over one step, placed at its
-    middle, of the piecewise linear interpolant; this reduces aliasing. Loads the field.
-    Raises ValueError for a step that leaves fewer than two samples, or for missing samples.
+    middle, of the piecewise linear interpolant; this reduces aliasing. The field is loaded.
+
+    Parameters
+    ----------
+    field : Dataset
+        Field over time.
+    dt_s : float
+        New time step in s.
+
+    Returns
+    -------
+    Dataset
+        The field at the new times.
+
+    Raises
+    ------
+    ValueError
+        If the step leaves fewer than two samples, or samples are missing.
     """
     t = grid_points(field, "time")
     if not 0 < dt_s <= 0.5 * (t[-1] - t[0]):
@@ -325,9 +452,24 @@ def resample(field: xr.Dataset, *, dt_s: float) -> xr.Dataset:
 def interpolate(field: xr.Dataset, *, max_gap_s: float | None = None) -> xr.Dataset:
     """Fill missing samples (NaN) by linear interpolation in time.
 
-    max_gap_s: longest gap to fill, measured between the samples on either side; None fills all.
-    Loads the field.
-    Raises ValueError for a longer gap, and for a gap at an end of the record.
+    The field is loaded.
+
+    Parameters
+    ----------
+    field : Dataset
+        Field over time.
+    max_gap_s : float, optional
+        Longest gap to fill, measured between the samples on either side, in s. None fills all.
+
+    Returns
+    -------
+    Dataset
+        The field without missing samples.
+
+    Raises
+    ------
+    ValueError
+        If a gap is longer, or lies at an end of the record.
     """
     t = grid_points(field, "time")
     filled = {}
@@ -362,36 +504,24 @@ def _check_gaps(name: str, t: np.ndarray, present: np.ndarray, max_gap_s: float 
         )
 
 
-def delay(
-    field: xr.Dataset, *, variable: str, delay_s: float, name: str | None = None
-) -> xr.Dataset:
-    """Add the delayed variable x(t - delay_s), interpolated linearly between samples.
-
-    name: by default `<variable>_delayed`. The first samples, for which the delayed value is not
-    known, are left out.
-    Raises ValueError for a delay that is not positive or as long as the record.
-    """
-    array = _samples(field, variable)
-    t = grid_points(field, "time")
-    name = name or f"{variable}_delayed"
-    check_new(field, name)
-    kept = t >= t[0] + delay_s * (1 - 1e-12)
-    if delay_s <= 0 or kept.sum() < 2:
-        raise ValueError(
-            f"delay_s must be positive and leave two samples or more, got {delay_s:g} s for a "
-            f"record of {t[-1] - t[0]:g} s"
-        )
-    straight = make_interp_spline(t, array.values, k=1, axis=0, check_finite=False)
-    past = straight(np.maximum(t[kept] - delay_s, t[0]))
-    later = field.isel(time=np.flatnonzero(kept))
-    return later.assign({name: (array.dims, past, array.attrs)})
-
-
 def derivative(field: xr.Dataset, *, variable: str, name: str | None = None) -> xr.Dataset:
     """Add a variable's rate of change, by central differences of second order.
 
-    name: by default `d<variable>_dt`. Steps may be unequal. Differentiation amplifies noise, so
-    apply `low_pass` first.
+    Steps may be unequal. Differentiation amplifies noise, so apply `low_pass` first.
+
+    Parameters
+    ----------
+    field : Dataset
+        Field over time.
+    variable : str
+        Name of the variable.
+    name : str, optional
+        Name of the new variable. None takes `d<variable>_dt`.
+
+    Returns
+    -------
+    Dataset
+        The field with the rate, in the unit of the variable per second.
     """
     array = _samples(field, variable)
     t = grid_points(field, "time")
@@ -409,7 +539,23 @@ def detrend(
 ) -> xr.Dataset:
     """Subtract a drift: a polynomial in time, fitted by least squares; the mean stays.
 
-    variables: names to detrend; None: all variables that depend on time.
+    Parameters
+    ----------
+    field : Dataset
+        Field over time.
+    variables : sequence of str, optional
+        Names of the variables to detrend. None takes all that depend on time.
+    degree : int, default 1
+        Degree of the polynomial.
+
+    Returns
+    -------
+    Dataset
+        The field without the drift.
+
+    Notes
+    -----
+    The polynomial p at each place minimises sum_k (x(t_k) - p(t_k))^2.
     """
     names = _of_time(field) if variables is None else list(variables)
     t = grid_points(field, "time")

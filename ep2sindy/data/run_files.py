@@ -171,18 +171,47 @@ def read_runs(
 ) -> list[Trajectory]:
     """Read runs with their operating points, one from each file.
 
-    files: a pattern such as "runs/V{V_D_V}_m{mdot_mg_s}.csv", whose placeholders are parameters and
-        in which `m4p5` is 4.5; or a glob such as "runs/*.nc", or a list of files.
-    parameters: names of those that each file says itself, as a column or variable that is constant,
-        or as an attribute.
-    states, inputs: names of variables; states None: all others but the parameters, and counters.
-    zone: of fields over z or r, the part that is averaged over.
-    units: variable or parameter -> unit, where the file states none. A time without one is in s.
-    dt_s, plasma: as for `open_field`, which opens the files.
-    Warns of files that are left out, for they fit a pattern but for a number.
-    Raises ValueError for a file that comes twice, and, naming the file, for a parameter that is
-    nowhere or not constant, a field without a zone, and whatever `open_field` refuses.
+    The values that vary from run to run, such as a voltage, become the `parameters` of each
+    trajectory.
 
+    Parameters
+    ----------
+    files : str, Path or sequence of these
+        A pattern such as "runs/V{V_D_V}_m{mdot_mg_s}.csv", whose placeholders are parameters and in
+        which `m4p5` stands for 4.5; or a pattern without placeholders such as "runs/*.nc"; or a
+        list of files.
+    parameters : sequence of str, default ()
+        Names of the parameters that each file states itself: as a column or variable that is
+        constant, or as an attribute.
+    states : sequence of str, optional
+        Names of the states. None takes all variables except the parameters and counters.
+    inputs : sequence of str, default ()
+        Names of the inputs.
+    zone : Zone, optional
+        Part of the grid that is averaged over, if the files hold fields over z or r.
+    units : mapping of str to str, optional
+        Unit by variable or parameter where the file states none. A time without a unit is in s.
+    dt_s, plasma : float, optional; bool, default False
+        As for `open_field`, which opens the files.
+
+    Returns
+    -------
+    list of Trajectory
+        One trajectory per file, in the order of the files.
+
+    Raises
+    ------
+    ValueError
+        If a file is listed twice, a parameter is missing or not constant, a field has no zone, or
+        `open_field` refuses a file. The error names the file.
+
+    Warns
+    -----
+    UserWarning
+        If files are left out because a placeholder matches something that is not a number.
+
+    Examples
+    --------
     >>> runs = ep.read_runs("run*.nc", states=["n_i", "n_n"], zone=ep.Zone(z=(0.01, 0.02)))
     >>> [run.label for run in runs]
     ['run.nc']

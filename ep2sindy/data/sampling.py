@@ -29,11 +29,38 @@ def zone_averages(
 ) -> Trajectory:
     """One trajectory of the averages over several zones, named `n_i@exit` and so on.
 
-    zones: name -> `Zone`, or (from, to) in z in m, in the order in which they lie. A grid point on
-    an edge that two zones fraction belongs to the first. Otherwise as `zone_average`, zone by zone.
-    Raises ValueError also for names that are no words, and for zones that overlap or come in
-    another order.
+    Each zone is averaged as `zone_average` does.
 
+    Parameters
+    ----------
+    field : Dataset
+        Field over time and z, r or both.
+    zones : mapping of str to Zone or (from, to)
+        A `Zone`, or its (from, to) in z in m, by name, in the order in which the zones lie. A grid
+        point on an edge that two zones share belongs to the first.
+    states : sequence of str
+        Names of the variables that become states in every zone.
+    inputs : sequence of str, default ()
+        Names of the variables that become inputs in every zone.
+    products : sequence of str, default ()
+        Products whose averages become inputs, as for `zone_average`.
+    axisymmetric : bool, default True
+        True if r is the radius of a cylinder, False if it is a Cartesian coordinate.
+    label : str, default ''
+        Label of the trajectory.
+
+    Returns
+    -------
+    Trajectory
+        The averages over time. The states of the first zone stand first.
+
+    Raises
+    ------
+    ValueError
+        As `zone_average`, and if a zone's name is not a word, or zones overlap or are out of order.
+
+    Examples
+    --------
     >>> field = ep.data.read_field("run.nc")
     >>> zones = {"anode": (0.0, 0.0125), "exit": (0.0125, 0.025)}
     >>> ep.zone_averages(field, zones, states=["n_i", "n_n"]).state_names
@@ -81,9 +108,24 @@ def side_by_side(zones: Mapping[str, Zone | Sequence[float]], field: xr.Dataset)
 class ZoneAverage:
     """Settings of `zone_average` without the field, for use in a config.
 
-    zones: those of `zone_averages`, taken in place of the one zone; or a number, for as many parts
-    of that zone, of equal length in z, called z1, z2 and so on.
-    Raises ValueError for zones that are neither names with places nor a number of one or more.
+    Parameters
+    ----------
+    states : sequence of str
+        Names of the variables that become states.
+    zone : Zone, optional
+        Part of the grid. None takes the whole field.
+    products : sequence of str, default ()
+        Products whose averages become inputs.
+    axisymmetric : bool, default True
+        True if r is the radius of a cylinder.
+    zones : mapping of str to Zone or (from, to), or int, optional
+        The zones of `zone_averages`, in place of the one zone; or a number of parts of `zone`, of
+        equal length in z, called z1, z2 and so on.
+
+    Raises
+    ------
+    ValueError
+        If zones are neither names with places nor a number of one or more.
     """
 
     states: Sequence[str]

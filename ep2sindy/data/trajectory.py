@@ -46,19 +46,43 @@ class ConstantStateError(ValueError):
 class Trajectory:
     """Time series of the modelled states and of the inputs that drive them.
 
-    t: (samples,) in s, increasing; steps may be unequal. Dates are counted from the first, in s.
-    states: (samples, n_states). inputs: (samples, n_inputs), by default none.
-    units: name -> unit for any of the variables and parameters; the default is "1".
-    missing: (samples, n_states), true where a state was not measured, such as a channel of a slower
-    rate; its samples there may be NaN and are interpolated. None if all were measured.
-    clock: unit in which times are displayed; t stays in s.
-    parameters: the operating point, name -> value of what was the same at all samples.
-    Raises ValueError for time that does not increase, unequal lengths, values that are masked, not
-    finite or not real numbers, a variable of a magnitude below 1e-50 or above 1e150, repeated
-    names, names that are not words of letters, digits and _ (or averages such as `<n_i*n_n>`),
-    fewer than two samples, a state that never changes, or parameters that are no finite numbers or
-    bear the name of a variable.
+    A trajectory is one record, measured or simulated. Its arrays are copied and cannot be changed;
+    methods such as `window` return a new trajectory.
 
+    Parameters
+    ----------
+    t : (samples,) array
+        Times in s, increasing. Steps may be unequal. Dates are counted from the first, in s.
+    states : (samples, n_states) array
+        Samples of the states, in SI.
+    state_names : sequence of str
+        One name per column of `states`.
+    inputs : (samples, n_inputs) array, default none
+        Samples of what drives the states from outside, such as a voltage.
+    input_names : sequence of str, default ()
+        One name per column of `inputs`.
+    units : mapping of str to str, default {}
+        Unit of any of the variables and parameters by name. A name that is absent has the unit "1".
+    label : str, default ''
+        Name of the record, shown in figures and tables.
+    clock : Clock, default SECONDS
+        Unit in which times are displayed. `t` stays in s.
+    missing : (samples, n_states) bool array, optional
+        True where a state was not measured, such as a channel of a slower rate. Samples there may
+        be NaN and are interpolated. None means that all were measured.
+    parameters : mapping of str to float, default {}
+        The operating point: the value of each quantity that was the same at all samples, by name.
+
+    Raises
+    ------
+    ValueError
+        If the times do not increase, lengths differ, values are masked, not finite or not real
+        numbers, a magnitude lies below 1e-50 or above 1e150, a name is repeated or is not a word of
+        letters, digits and _ (or an average such as `<n_i*n_n>`), there are fewer than two samples,
+        a state never changes, or a parameter is not a finite number or has the name of a variable.
+
+    Examples
+    --------
     >>> t = np.linspace(0.0, 1e-3, 101)
     >>> run = ep.Trajectory(t, np.sin(6e4 * t)[:, None], ["I_d"], units={"I_d": "A"})
     >>> run.n_samples, run.columns(["I_d"]).shape

@@ -41,21 +41,59 @@ def zone_average(
     axisymmetric: bool = True,
     label: str = "",
 ) -> Trajectory:
-    """Average variables over the grid points inside a zone (None: the whole field), at each time.
+    """Average variables over the grid points inside a zone, at each time.
 
-    Weights are the sizes of the cells: length in z and, if the field has r, annulus area (length
-    if not axisymmetric). All variables of the call are averaged over the same cells: those in
-    which none of them is masked.
-    products: each, such as "n_i*n_n*R_ion", adds an input named `<n_i*n_n*R_ion>` with the average
-    of the product, which is not the product of averages. If a variable's attribute `average_of`
-    names the product, that variable is used: like a simulation's samples, it is averaged in time.
-    Sums run in float64, over parts of the field that fit into memory. Samples at which a variable
-    of time alone is missing (NaN) are left out for all variables.
-    Raises ValueError for an unknown variable, a zone off the grid or without plasma, or a
-    value that is not finite in an unmasked cell.
+    The weight of a grid point is the size of its cell: its length in z and, if the field has r, the
+    area of its annulus (its length if the field is not axisymmetric). All variables of one call are
+    averaged over the same cells, those in which none of them is masked. Samples at which a variable
+    of time only is missing (NaN) are left out for all variables.
 
+    Parameters
+    ----------
+    field : Dataset
+        Field over time and z, r or both.
+    zone : Zone or None
+        Part of the grid. None takes the whole field.
+    states : sequence of str
+        Names of the variables that become states.
+    inputs : sequence of str, default ()
+        Names of the variables that become inputs.
+    products : sequence of str, default ()
+        Each product, such as `"n_i*n_n*R_ion"`, adds an input named `<n_i*n_n*R_ion>` with the
+        average of the product, which is not the product of averages. If a variable's attribute
+        `average_of` names the product, that variable is used, since it is averaged in time as a
+        simulation's samples are.
+    axisymmetric : bool, default True
+        True if r is the radius of a cylinder, False if it is a Cartesian coordinate.
+    label : str, default ''
+        Label of the trajectory.
+
+    Returns
+    -------
+    Trajectory
+        The averages over time, with the units of the field.
+
+    Raises
+    ------
+    ValueError
+        If a variable is unknown, the zone lies off the grid or holds no plasma, or a value is not
+        finite in an unmasked cell.
+
+    Notes
+    -----
+    The average of x at time t is
+
+        <x>(t) = sum_c w_c x_c(t) / sum_c w_c,   w_c = dz dr or pi (r_outer^2 - r_inner^2) dz
+
+    over the cells c of the zone. Sums are computed in float64, over parts of the field that fit
+    into memory.
+
+    Examples
+    --------
     >>> field = ep.data.read_field("run.nc")
     >>> run = ep.zone_average(field, ep.Zone(z=(0.01, 0.02)), states=["n_i", "n_n"])
+    >>> run.state_names, run.n_samples
+    (('n_i', 'n_n'), 300)
     """
     check_field(field)
     columns = {name: [(name, 1)] for name in (*states, *inputs)}
@@ -184,11 +222,27 @@ PARTS = {"channel": 1.0, "downstream": 0.4}
 
 @dataclass(frozen=True)
 class Zone:
-    """Part of the grid: (from, to) in z and r, in m, ends included; None is the whole axis.
+    """Part of the grid of a field: a range or a place in z and in r.
 
-    A number is a place: the grid point nearest to it. z: "channel" is the thruster's channel from
-    the anode to the exit, "downstream" its last 40 %. The channel's length comes from the field's
-    attributes; a field without z needs none.
+    Parameters
+    ----------
+    z : (float, float), float or str, optional
+        (from, to) in m, ends included. A number is a place: the grid point nearest to it. "channel"
+        is the thruster's channel from the anode to the exit, "downstream" its last 40 %; its length
+        is an attribute of the field, and a field without z needs none. None takes the whole axis.
+    r : (float, float) or float, optional
+        (from, to) in m, ends included, or a place. None takes the whole axis.
+
+    Raises
+    ------
+    ValueError
+        If a range is not a number or two increasing ones, or the name of a part is unknown.
+
+    Examples
+    --------
+    >>> zone = ep.Zone(z=(0.01, 0.02))
+    >>> zone.z, zone.r
+    ((0.01, 0.02), None)
     """
 
     z: Sequence[float] | float | str | None = None
@@ -245,7 +299,11 @@ def _at_peak(field: xr.Dataset) -> str:
 
 
 def _part_text(name: str) -> str:
-    return "the channel" if PARTS[name] == 1.0 else f"the last {PARTS[name]:.0%} of the channel"
+    return (
+        "the channel"
+        if PARTS[name] == 1.0
+        else f"the last {100.0 * PARTS[name]:.0f} % of the channel"
+    )
 
 
 def _nearest(points: Float[np.ndarray, " points"], place: float, axis: str) -> int:

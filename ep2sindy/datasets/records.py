@@ -16,10 +16,20 @@ FOLDER = Path(__file__).parent
 def pendulum_swing() -> Trajectory:
     """Angle theta, in rad, of one free, damped swing of a single pendulum, 5.5 s at 1 kHz.
 
+    Returns
+    -------
+    Trajectory
+        The record.
+
+    Notes
+    -----
     The bearing has dry friction. The encoder has steps of about 5e-4 rad.
+
     Source: Kaheman, Fasel, Bramburger, Strom, Kutz & Brunton 2022, arXiv:2205.06231,
     github.com/dynamicslab/MultiArm-Pendulum, MIT licence, (c) 2022 dynamicslab.
 
+    Examples
+    --------
     >>> ep.data.pendulum_swing().n_samples
     5500
     """
@@ -29,9 +39,17 @@ def pendulum_swing() -> Trajectory:
 def hare_lynx() -> Trajectory:
     """Pelts of hare and lynx, in thousands, that the Hudson's Bay Company traded, 1900 to 1920.
 
-    Times are in s, and shown in years since 1900.
+    Returns
+    -------
+    Trajectory
+        The record. Times are in s, and displayed in years since 1900.
+
+    Notes
+    -----
     Source: Odum 1953, Fundamentals of Ecology; public figures.
 
+    Examples
+    --------
     >>> ep.data.hare_lynx().states[0].tolist()
     [30.0, 4.0]
     """
@@ -41,9 +59,17 @@ def hare_lynx() -> Trajectory:
 def gause() -> Trajectory:
     """Counts of Paramecium aurelia and of its prey, a yeast, per 0.5 ml, on 18 days.
 
-    Times are in s, and shown in days.
+    Returns
+    -------
+    Trajectory
+        The record. Times are in s, and displayed in days.
+
+    Notes
+    -----
     Source: Gause, Smaragdova & Witt 1935; digitised in github.com/gugushvili/predator_prey, CC0.
 
+    Examples
+    --------
     >>> ep.data.gause().state_names
     ('paramecium', 'yeast')
     """

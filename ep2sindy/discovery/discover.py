@@ -43,39 +43,85 @@ def discover(
 ) -> Discovery:
     """Find sparse equations for every state of the runs.
 
-    The method makes candidates, chooses one per equation, and fits it: a `TrajectorySearch` by the
-    likelihood of whole trajectories, a `Regression` by rows.
-    runs: one run, or a list or dict of runs: Trajectory, DataFrame, Dataset, (t, x), or x with t,
-    its times or its step in s; inputs: columns that are inputs; see `trajectories_of`. library:
-    candidate terms, with what is known of the equations: `Library.relate`, `only`, `exclude`,
-    `known` and `with_roles`. None means every product of the first run's variables and of hidden
-    states up to degree 2. method: None means TrajectorySearch(), the best method we know for noisy
-    data. hidden: names of states that nobody measured, or their number, for states h, or h1, h2,
-    ...; they and their equations are found with the others', by a `TrajectorySearch`. decimate:
-    number of samples that are replaced by their mean; "auto" leaves a hundred to a period of
-    records of over 20,000 samples together, and says so; None takes all samples. progress: True
-    shows bars.
+    The method proposes candidate equations, selects one per state and fits it: a `TrajectorySearch`
+    by the likelihood of whole trajectories, a `Regression` by rows.
 
-    Runs whose `parameters` differ are of several operating points, and each point is searched
-    alone, by the workers; `points` of the result holds what was found there. shared: True finds one
-    support for all points, with coefficients of each. law: finds one support whose coefficients are
-    functions of the parameters: polynomials of this degree, those of a library such as
-    ep.named_terms(["V"], ["1", "1/V"]), or "auto", those whose law errs least at points left out,
-    of each parameter p, p^2 and 1/p (`PointFits.choose_functions`); or a list of these, of which
-    one is chosen. Supports of several points are found by rows (`search_shared`), or under roles at
-    the most central point; a TrajectorySearch then refines the coefficients of every point on its
-    trajectories.
-    Raises ValueError for facts of states that there are not, roles that the method cannot keep,
-    runs whose states or units differ, states or samples that repeat, runs that lack parameters, or
-    points that do not suffice for the law.
+    Runs whose `parameters` differ come from several operating points. Each point is then searched
+    independently, by the workers, and `points` of the result holds what was found there. `shared`
+    and `law` connect the points. Supports of several points are found by rows (`search_shared`), or
+    under roles at the most central point; a `TrajectorySearch` then refines the coefficients of
+    every point on its trajectories.
+
+    Parameters
+    ----------
+    runs : run, or list or dict of runs
+        A run is a Trajectory, a DataFrame with times, a Dataset, a tuple (t, x), or an array x with
+        `t`. The keys of a dict are the runs' labels.
+    library : Library, optional
+        Candidate terms, with what is known of the equations (`Library.relate`, `only`, `exclude`,
+        `known`, `with_roles`). None takes every product of the first run's variables and of the
+        hidden states up to degree 2.
+    method : DiscoveryMethod, optional
+        None takes `TrajectorySearch()`, the best method that we know for noisy data.
+    law : int, Library, "auto" or list of these, optional
+        Finds one support whose coefficients are functions of the parameters: polynomials of this
+        degree; those of a library such as `ep.named_terms(["V"], ["1", "1/V"])`; or with "auto"
+        those, made of each parameter p, p^2 and 1/p, whose law errs least at points left out. From
+        a list one is chosen.
+    shared : bool, default False
+        True finds one support for all points, with separate coefficients at each.
+    hidden : sequence of str or int, default ()
+        Names of states that nobody measured, or their number, for states h, or h1, h2, ... They and
+        their equations are found together with the others, by a `TrajectorySearch`.
+    t : array_like or float, optional
+        Times in s of runs without times, or their time step in s.
+    inputs : sequence of str, default ()
+        Names of the columns of a table that are inputs and not states.
+    decimate : int, "auto" or None, default "auto"
+        Number of samples that are replaced by their mean. "auto" leaves a hundred samples per
+        period if the records hold over 20,000 samples together, and reports it. None takes all
+        samples.
+    seed : int or Generator, default 0
+        Of all random choices, such as splits and bootstraps.
+    workers : Workers, optional
+        How operating points are computed: in this process, or in parallel (`ep.parallel`).
+    progress : Progress or bool, default False
+        True shows progress bars.
+
+    Returns
+    -------
+    Discovery
+        The selected equations, all candidates with their scores, and warnings.
+
+    Raises
+    ------
+    ValueError
+        If a fact of the library names an unknown state, the method cannot respect the roles, states
+        or units differ between runs, states or samples repeat, runs lack parameters, or there are
+        too few points for the law.
+
+    Notes
+    -----
+    The searches state what they minimise: see `TrajectorySearch`, `BestSubset`, `AdaptiveLasso` and
+    `STLSQ`. Assumes that the equations are x' = sum_j c_j theta_j(x, u), with all their terms in
+    the library.
+
+    Examples
+    --------
+    >>> run = ep.lotka_volterra(a=0.7).trajectory(noise=0.02, rng=0)
+    >>> print(ep.discover(run, method=ep.Regression()).model.text(digits=1))
+    x' = 0.7 x - 1 x y
+    y' = -0.3 y + 1 x y
+
+    With a law, the coefficients become functions of the operating point.
 
     >>> from dataclasses import replace
-    >>> growth = (0.5, 0.7, 0.9, 1.1)
+    >>> growth = (0.5, 0.8, 1.1)
     >>> runs = [ep.lotka_volterra(a=a).trajectory(noise=0.02, rng=0) for a in growth]
     >>> runs = [replace(run, parameters={"a": a}) for run, a in zip(runs, growth)]
     >>> found = ep.discover(runs, method=ep.Regression(), law=1)
-    >>> found.law.at(a=0.8).terms("x")
-    {'x': 0.799..., 'x*y': -1.000...}
+    >>> found.law.at(a=0.7).terms("x")
+    {'x': 0.699..., 'x*y': -1.000...}
     """
     method = method or TrajectorySearch()
     trajectories = trajectories_of(runs, t=t, inputs=inputs, partial=True)

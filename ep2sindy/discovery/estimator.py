@@ -27,14 +27,37 @@ if TYPE_CHECKING:
 class SINDy(BaseEstimator):
     """Equations x' = f(x, u) found in samples, with the methods of a scikit-learn estimator.
 
-    degree, functions: of the library of terms, as for `ep.polynomial`; library: in place of both, a
-    library over the names of the features. method: None means `TrajectorySearch()`, as for
-    `ep.discover`. seed: of the search.
     In `fit` and `score`, times t take the place of y. Folds must keep them in order, as KFold() and
     TimeSeriesSplit() do.
-    Attributes after `fit`: model_, discovery_, input_names_ of the columns of u, n_features_in_,
-    feature_names_in_ of a DataFrame.
 
+    Parameters
+    ----------
+    degree : int, default 2
+        Degree of the library, as for `ep.polynomial`.
+    functions : sequence of str, default ()
+        Functions of the library, as for `ep.polynomial`.
+    library : Library, optional
+        A library over the names of the features, in place of degree and functions.
+    method : DiscoveryMethod, optional
+        None takes `TrajectorySearch()`, as for `ep.discover`.
+    seed : int, default 0
+        Of the search.
+
+    Attributes
+    ----------
+    model_ : SparseModel
+        The equations, after `fit`.
+    discovery_ : Discovery
+        The whole result, after `fit`.
+    input_names_ : tuple of str
+        Names of the columns of u, after `fit`.
+    n_features_in_ : int
+        Number of columns of X, after `fit`.
+    feature_names_in_ : array
+        Names of the columns, after `fit` on a DataFrame.
+
+    Examples
+    --------
     >>> run = ep.lotka_volterra().trajectory(noise=0.02, rng=0)
     >>> found = ep.discovery.SINDy(degree=2).fit(run.states, run.t)
     >>> list(found.model_.terms("x0"))
@@ -73,11 +96,28 @@ class SINDy(BaseEstimator):
     ) -> SINDy:
         """Find the equations of all trajectories.
 
-        X: (samples, n_states), an array or a DataFrame, whose columns give the names; or a list of
-        such, one for each trajectory. t: (samples,) in s, increasing, or a step in s; of several
-        trajectories a list, or one for all. u: (samples, n_inputs) of an input, in a list as X is.
-        feature_names: of the states, then of the inputs; by default x0, x1, ... and u0, u1, ...
-        Raises ValueError for samples without times, and whatever `ep.discover` refuses.
+        Parameters
+        ----------
+        X : array or DataFrame (samples, n_states), or list of these
+            Samples of one trajectory, or a list with one entry per trajectory. The columns of a
+            DataFrame give the names.
+        t : (samples,) array or float, or list of these
+            Times in s, increasing, or a time step in s. For several trajectories a list, or one for
+            all.
+        u : (samples, n_inputs) array, or list of these, optional
+            Samples of the inputs.
+        feature_names : sequence of str, optional
+            Names of the states, then of the inputs. None takes x0, x1, ... and u0, u1, ...
+
+        Returns
+        -------
+        SINDy
+            This estimator, fitted.
+
+        Raises
+        ------
+        ValueError
+            If samples have no times, or `ep.discover` refuses them.
         """
         runs = self._runs(X, t, u, feature_names, reset=True)
         library = self.library

@@ -53,16 +53,52 @@ class Finding:
 class TrajectorySearch:
     """Search by the likelihood of whole trajectories, states and coefficients fitted together.
 
-    For noisy samples of all states of a system whose law the library holds. No derivative is
-    estimated, so it finds laws that no regression can (docs/estimation.md). The noise may be white,
-    or correlated over some samples. max_terms: of one equation; None allows seven, and more where
-    an equation of a large library needs them. align: if True, channels found to be delayed are
-    shifted forward; if False, delayed channels count as a lack of fit of the model, and their
-    delays are reported. limit_s: wall time after which the search ends with the best that it has,
-    and says so. courses: input -> how it goes from one sample to the next, "held", "linear" or
-    "smooth"; of others the likeliest course is taken. selection: Evidence, or a rule that runs
-    models, such as FreeRunScore. depth: candidates kept per size, for such a rule to assess. Raises
-    ValueError for fewer than one term, or a rule that does not go with the search.
+    It is made for noisy samples of all states of a system whose law the library contains. No
+    derivative is estimated, so that it finds laws that no regression can find.
+
+    Parameters
+    ----------
+    max_terms : int, optional
+        The most terms of one equation. None allows seven, and more where an equation of a large
+        library needs them.
+    align : bool, default False
+        True shifts channels that lag forward. False counts a channel delay as a lack of fit of the
+        model, and reports the delay.
+    limit_s : float, optional
+        Wall time in s after which the search ends with the best model that it has, and reports so.
+    selection : Selection, default Evidence()
+        `ep.discovery.Evidence()`, or a rule that runs models, such as `FreeRunScore()`.
+    depth : int, default 1
+        Number of candidates of each size that such a rule tests.
+    courses : mapping of str to str, optional
+        How each input goes from one sample to the next: "held", "linear" or "smooth". For other
+        inputs the likeliest course is taken.
+
+    Raises
+    ------
+    ValueError
+        If max_terms or depth is below one, the limit is not positive, or the rule does not go with
+        this search.
+
+    Notes
+    -----
+    Minimises over the states x at all samples, the coefficients c and their support
+
+        sum_k |(y_k - x_k) / sigma|^2 + sum_k |(F(x_k; c) - x_(k+1)) / (rho sigma)|^2
+        + sum_j penalty_j
+
+    with the samples y, their noise sigma, and the flow F of the equations over one step. rho falls
+    from 0.3 (relaxed states) to 1e-4 (an exact trajectory). The penalty of a term is that of
+    `ep.discovery.Evidence`. Assumes independent, normal noise, white or correlated over some
+    samples.
+
+    Source: de Jong 1991, doi:10.1214/aos/1176348139, for the filter; docs/estimation.md.
+
+    Examples
+    --------
+    >>> run = ep.lotka_volterra().trajectory(noise=0.1, rng=0)
+    >>> list(ep.discover(run, method=ep.TrajectorySearch(max_terms=3)).model.terms("x"))
+    ['x', 'x*y']
     """
 
     max_terms: int | None = None
@@ -196,14 +232,42 @@ class SearchedEquation:
 class Regression:
     """Search by regression: a formulation makes rows, and a search proposes supports for them.
 
-    The search runs in every bootstrap of the rows. Each support is fitted to all training rows, and
-    the best of every size make the front; the rule selects one per equation. If the noise of the
-    samples is propagated into the rows, the selected terms are fitted again with weights.
-    Regression() is the best regression that we know; the thesis's is written below.
-    depth: candidates kept per size. 3 lets a true support win that noise has ranked second or
-    third.
-    Raises ValueError for a value that is no formulation, search, rule or bootstraps.
+    The search runs in every bootstrap of the rows. Each proposed support is fitted to all training
+    rows, the best of every size form the front, and the rule selects one per equation. If the noise
+    of the samples is propagated into the rows, the selected terms are fitted again with weights.
+    `Regression()` is the best regression that we know; the example shows that of the thesis.
 
+    Parameters
+    ----------
+    formulation : Formulation, default WeightedWeak()
+        How samples become rows: `Differential`, `Weak` or `WeightedWeak`.
+    search : Search, default BestSubset()
+        What proposes supports: `BestSubset`, `AdaptiveLasso` or `STLSQ`.
+    selection : Selection, default EBIC()
+        What selects a candidate of the front: `EBIC`, `Knee` or `FreeRunScore`.
+    bootstraps : Bootstraps, default Bootstraps(n=0)
+        How often the search is repeated on random rows. With n = 0 it runs once, on all training
+        rows.
+    depth : int, default 1
+        Number of candidates of each size on the front. 3 lets a true support be selected that noise
+        has ranked second or third.
+
+    Raises
+    ------
+    ValueError
+        If a value is not a formulation, search, rule or bootstraps, or depth is below one.
+
+    Notes
+    -----
+    Every support S is fitted by least squares,
+
+        minimise |y - X_S b|^2 over b
+
+    with one row of y and X per sample or window, in the unit of the derivative. The search and the
+    rule state their own objectives.
+
+    Examples
+    --------
     >>> thesis = ep.Regression(ep.Differential(), ep.AdaptiveLasso(), ep.Knee(), ep.Bootstraps())
     >>> run = ep.lotka_volterra().trajectory(noise=0.01, rng=0)
     >>> list(ep.discover(run, method=thesis, seed=0).model.terms("x"))

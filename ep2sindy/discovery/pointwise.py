@@ -51,12 +51,27 @@ LAYOUT: Mapping[str, tuple[str, ...]] = {
 class PointSearch:
     """Settings of the search at every point, whose spread is taken over the bootstraps.
 
-    library: with relations between coefficients, if there are some, such as
-    "n_i: S == -1 * n_n: S" for ionization S, which makes of a neutral an ion; the same at every
-    point.
-    least_variation: standard deviation of every state, as a fraction of its root mean square, below
-    which a point counts as having no dynamics. seed: every point has the same split and the same
-    draws, so that results differ by place alone.
+    Parameters
+    ----------
+    states : sequence of str
+        Names of the field's variables that become states.
+    library : Library
+        Terms, with relations between coefficients if there are some, such as
+        "n_i: S == -1 * n_n: S" for ionization S, which turns a neutral into an ion. They are the
+        same at every point.
+    method : Regression
+        The regression, with bootstraps.
+    least_variation : float, default 0.001
+        Standard deviation of every state, as a fraction of its root mean square, below which a
+        point counts as having no dynamics.
+    seed : int, default 0
+        Every point has the same split and the same draws, so that results differ only by place.
+
+    Raises
+    ------
+    ValueError
+        If a setting is of the wrong kind or out of range, the method has no bootstraps, relations
+        contradict each other or meet bootstraps that leave out terms, or the library has roles.
     """
 
     states: Sequence[str]
@@ -111,18 +126,49 @@ def pointwise(
     block_points: int = 256,
     progress: Progress | Advance | bool = False,
 ) -> xr.Dataset:
-    """Search at every point of a (time, z, r), (time, z) or (time, r) field, block by block.
+    """Search at every point of a field over (time, z, r), (time, z) or (time, r), block by block.
 
-    Returns, over `equation`, `term`, `draw` and the axes of the field:
-    coef, in SI, zero for a term outside the selected support; inclusion, fraction of bootstraps
-    whose support of that size held the term; weight, coef times the root mean square of its term,
-    with its sign, as a fraction of all terms of the equation (not the variance: the constant has
-    none); coef_draws and weight_draws, the same in every bootstrap; r2_train, r2_test, n_terms per
-    equation; status per point. If the status is not 0, the others are NaN. The attribute no_fit
-    holds a reason why a fit failed, if one did. If the field is opened lazily, only the current
-    block is in memory. progress: True shows a bar; a function is called with the number of points
-    of every finished block; see `Progress`. Raises ValueError for a field without space, a variable
-    it lacks, or, with the first reason, if no point could be fitted.
+    If the field is opened lazily, only the current block is in memory.
+
+    Parameters
+    ----------
+    field : Dataset
+        Field over time and z, r or both, in SI.
+    search : PointSearch
+        States, library and method, the same at every point.
+    workers : Workers
+        How the blocks are computed, such as `ep.parallel.Serial()` or `ep.parallel.Loky()`.
+    block_points : int, default 256
+        Number of points in a block.
+    progress : Progress, callable or bool, default False
+        True shows a bar. A function is called with the number of points of every finished block.
+
+    Returns
+    -------
+    Dataset
+        A dataset over `equation`, `term`, `draw` and the axes of the field: `coef`, in SI, zero for
+        a term outside the selected support; `inclusion`, the fraction of bootstraps whose support
+        of that size held the term; `weight`, coef times the root mean square of its term, with its
+        sign, as a fraction of all terms of the equation; `coef_draws` and `weight_draws`, the same
+        in every bootstrap; `r2_train`, `r2_test` and `n_terms` per equation; and `status` per
+        point. Where the status is not 0, all others are NaN. If a fit failed, the attribute
+        `no_fit` holds a reason.
+
+    Raises
+    ------
+    ValueError
+        If the field has no axis in space or lacks a variable, or no point could be fitted; the
+        error then states the first reason.
+
+    Examples
+    --------
+    >>> field = ep.open_field("run.nc")
+    >>> method = ep.Regression(ep.Differential(), bootstraps=ep.Bootstraps(4, n_culled=0))
+    >>> library = ep.polynomial(["n_i", "n_n"], degree=1)
+    >>> search = ep.discovery.PointSearch(["n_i", "n_n"], library, method)
+    >>> found = ep.pointwise(field.isel(z=[2], r=[2]), search, workers=ep.parallel.Serial())
+    >>> found["coef"].sizes["term"], found["status"].values.tolist()
+    (3, [[0]])
     """
     _check(field, search)
     part = field[list(search.variables)]

@@ -101,23 +101,46 @@ STORED = {
 
 @dataclass(frozen=True, eq=False)
 class Discovery:
-    """Result of a discovery: the candidates of every state, and the model of the selected ones.
+    """Result of `discover`: the candidates of every state, and the model of the selected ones.
 
-    fronts: for each state, candidates with their scores, the lowest selected. chosen: for each
-    state, the selected candidate with its coefficients in the model. If the noise of the samples is
-    propagated into the rows, these come from a weighted refit. Their covariance is in the model.
-    method: that found the model. noise_test: test of the residuals against the noise.
-    ambiguities: terms that these data cannot distinguish, and warnings of too few rows for the
-    terms. note: how a rule for whole systems decided, how certain a trajectory search is, or that
-    the residuals exceed the noise; else empty. data_warnings: sentences on where the samples
-    deviate from the assumptions (`Estimate.data-quality warnings`). estimate: of states and
-    coefficients together, after a trajectory search. constraint: that the model's coefficients obey
-    under relations or roles, to be handed to `refine`; None without. others: of a rule that runs
-    whole systems, those of as many free coefficients that sustain their oscillation as well.
-    points: of runs at several operating points, the discovery at each, by its label, such as
-    "V_D_V=300, mdot_mg_s=5"; model and all else are then those of the most central point. law: of
-    all coefficients over the operating points, if it was asked for.
+    It prints the equations with 95 % intervals, and what limits them.
 
+    Parameters
+    ----------
+    fronts : mapping of str to ParetoFront
+        For each state, its candidates with their scores. The lowest score is selected.
+    chosen : mapping of str to Candidate
+        For each state, the selected candidate with its coefficients in the model. If the noise of
+        the samples is propagated into the rows, the coefficients come from a weighted refit.
+    model : SparseModel
+        The selected equations, with the covariance of their coefficients.
+    method : DiscoveryMethod
+        The method that found the model.
+    ambiguities : sequence of Ambiguity, default ()
+        Terms that these data cannot distinguish, and warnings of too few rows for the terms.
+    noise_test : NoiseTest, default NoiseTest()
+        Test of the residuals against the noise.
+    note : str, default ''
+        How a rule for whole systems decided, how certain a trajectory search is, or that the
+        residuals exceed the noise. Otherwise empty.
+    data_warnings : sequence of str, default ()
+        Sentences on where the samples deviate from the assumptions.
+    estimate : Estimate, optional
+        The states and coefficients estimated together, after a trajectory search.
+    constraint : Constraint, optional
+        What the model's coefficients obey under relations or roles, for use in `refine`. None
+        without.
+    others : sequence of OtherSystem, default ()
+        After a rule that runs whole systems: the systems with as many free coefficients that also
+        sustain their oscillation.
+    points : mapping of str to Discovery, default {}
+        For runs at several operating points, the discovery at each, by its label, such as
+        "V_D_V=300, mdot_mg_s=5". The model and all else are then those of the most central point.
+    law : OperatingLaw, optional
+        The law of all coefficients over the operating points, if it was asked for.
+
+    Examples
+    --------
     >>> run = ep.lotka_volterra().trajectory(noise=0.05, rng=0)
     >>> found = ep.discover(run)
     >>> found.model.terms("x")
@@ -183,7 +206,25 @@ class Discovery:
     ) -> Forecast:
         """Forecast from the end of a record, with bands; see `ep.forecast`.
 
-        history: the samples before the forecast. horizon: a duration or times, in s.
+        Parameters
+        ----------
+        history : run
+            The samples before the forecast.
+        horizon : float or array-like
+            Duration in s, or times in s.
+        fitted_to : run, optional
+            The record that the model was fitted to. None takes the history.
+        inputs : array-like or mapping of str to any, optional
+            Inputs of a driven model over the horizon.
+        n_draws : int, default 200
+            Number of runs of which the bands are made.
+        seed : int, default 0
+            Of the random draws.
+
+        Returns
+        -------
+        Forecast
+            Median and bands.
         """
         return forecast(
             self.model, history, horizon, fitted_to=fitted_to, inputs=inputs, n_draws=n_draws,

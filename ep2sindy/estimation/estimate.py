@@ -151,26 +151,66 @@ def estimate(
 ) -> Estimate:
     """Estimate the states at every sample and sparse coefficients together, by maximum likelihood.
 
-    runs: one run or a list, see `trajectories_of`; all share the coefficients. Samples may be
-    spaced unequally. Inputs are taken as exact. max_terms: the most terms of one equation; None
-    allows seven, and more where an equation of a large library needs them. align: if True, channels
-    found to be late are shifted forward; if False, delayed channels count as a lack of fit of the
-    model, and their delays are reported. library: with what is known of the equations, as for
-    `discover`. hidden: states that nobody measured, which the library has; all ways in which they
-    may enter are compared. courses: input -> how it goes from one sample to the next, "held",
-    "linear" or "smooth"; of others the likeliest course is taken. limit_s: wall time after which
-    the search ends with the best that it has, and says so; of long records it takes parts first.
-    progress: True shows bars, see `Progress`; an interruption (Ctrl-C) then ends the search in the
-    same way.
+    `discover` with a `TrajectorySearch` calls this function and adds candidates and scores.
 
+    Parameters
+    ----------
+    runs : run, or list or dict of runs
+        As `discover` takes them. All runs share the coefficients. Samples may be spaced unequally.
+        Inputs are taken as exact.
+    library : Library
+        Candidate terms, with what is known of the equations, as for `discover`.
+    max_terms : int, optional
+        The most terms of one equation. None allows seven, and more where an equation of a large
+        library needs them.
+    align : bool, default False
+        True shifts channels that lag forward. False counts a channel delay as a lack of fit of the
+        model, and reports the delay.
+    hidden : sequence of str, default ()
+        States that nobody measured, which the library contains. All ways in which they may enter
+        are compared.
+    courses : mapping of str to str, optional
+        How each input goes from one sample to the next: "held", "linear" or "smooth". For other
+        inputs the likeliest course is taken.
+    provenance : mapping of str to str, optional
+        Entries added to the model's record of its origin.
+    limit_s : float, optional
+        Wall time in s after which the search ends with the best model that it has, and reports so.
+        Long records are then searched in parts first.
+    progress : Progress or bool, default False
+        True shows bars. An interruption (Ctrl-C) then ends the search in the same way as `limit_s`.
+
+    Returns
+    -------
+    Estimate
+        The model, the estimated states and noise, rival supports, and warnings.
+
+    Raises
+    ------
+    ValueError
+        If max_terms is below one, the limit is not positive, the library needs more samples or
+        memory than there is, an input or a course is unknown, or the runs do not go together.
+
+    Notes
+    -----
+    Minimises over the states x at all samples, the coefficients c and their support
+
+        sum_k |(y_k - x_k) / sigma|^2 + sum_k |(F(x_k; c) - x_(k+1)) / (rho sigma)|^2
+        + sum_j penalty_j
+
+    with the samples y, their noise sigma, and the flow F of the equations over one step. rho falls
+    from 0.3 (relaxed states) to 1e-4 (an exact trajectory). The penalty of a term is that of
+    `ep.discovery.Evidence`. Assumes independent, normal noise, white or correlated over some
+    samples.
+
+    Source: de Jong 1991, doi:10.1214/aos/1176348139, for the filter; docs/estimation.md.
+
+    Examples
+    --------
     >>> run = ep.lotka_volterra().trajectory(noise=0.05, rng=0)
     >>> found = ep.estimate(run, ep.polynomial(["x", "y"], degree=2))
     >>> sorted(found.model.terms("x"))
     ['x', 'x*y']
-
-    Raises ValueError for fewer than one term, a limit that is not positive, a library that needs
-    more samples than there are or more memory, an unknown input or course, or whatever a
-    `DiscoveryProblem` refuses.
     """
     task = DiscoveryProblem(trajectories_of(runs, partial=True), library, hidden)
     if max_terms is not None:
@@ -439,6 +479,6 @@ def _open_choice(
         return ""
     return (
         f"{problem.n_samples} samples do not tell these equations from others: the chance that all "
-        f"terms are right is {fraction:.0%}; name the terms that you know (Library.only), take a "
-        "smaller library, or a longer record"
+        f"terms are right is {100.0 * fraction:.0f} %; name the terms that you know "
+        "(Library.only), take a smaller library, or a longer record"
     )

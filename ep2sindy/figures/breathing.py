@@ -1,9 +1,8 @@
-"""Figures of simulated discharges: one run with its maps over z and time, and scans."""
+"""Figures of a simulated discharge, with its maps over z and time."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
 from textwrap import fill
 from typing import Any
 
@@ -13,8 +12,6 @@ import xarray as xr
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch, Rectangle
 
 from ep2sindy.data.fields import cell_edges
 from ep2sindy.figures import style
@@ -177,116 +174,3 @@ def last_periods(t: Float[np.ndarray, " time"], f_kHz: float, periods: float) ->
     duration_s = periods / (1e3 * f_kHz) if np.isfinite(f_kHz) and f_kHz > 0.0 else fraction
     start = int(np.searchsorted(t, t[-1] - duration_s))
     return slice(max(0, min(start, t.size - 16)), t.size)
-
-
-BREATHES = "oscillating"
-HATCHES = {
-    "steady": "//", "decaying": "\\\\", "transit": "..", "out": "--", "diverged": "xx",
-    "failed": "++",
-}  # fmt: skip
-# A marker for a status, or an upright line if the current is meaningless.
-QUIET: dict[str, Any] = {"ls": "none", "color": COLOURS[1]}
-STATUS_STYLES: dict[str, dict[str, Any]] = {
-    BREATHES: {"ls": "none", "color": COLOURS[0], "marker": "o"},
-    "steady": {**QUIET, "marker": "s"},
-    "decaying": {**QUIET, "marker": "v"},
-    "transit": {**QUIET, "marker": "D"},
-    "out": {**QUIET, "marker": "_"},
-    "diverged": {"ls": ":", "color": COLOURS[3]},
-    "failed": {"ls": "--", "color": COLOURS[3]},
-}
-WORTHLESS = ("diverged", "failed")  # statuses whose current is meaningless
-CURVES = {  # column -> title, factor
-    "I_d_mean": ("discharge current (A)", 1.0),
-    "f_kHz": ("frequency (kHz)", 1.0),
-    "thrust_N": ("thrust (mN)", 1e3),
-    "anode_efficiency": ("anode efficiency (%)", 100.0),
-}
-
-
-def stability_figure(
-    points: pd.DataFrame, axes: Sequence[str], labels: Mapping[str, str]
-) -> Figure:
-    """Standard deviation of the current over two parameters; one panel per value of the others.
-
-    points: texts in the columns `axes`, the first along x, and status, cycle, I_d_std and f_kHz.
-    labels: names of the parameters.
-    """
-    along, up, *others = axes
-    groups = list(points.groupby(others, sort=False)) if others else [((), points)]
-    x, y = (list(dict.fromkeys(points[name])) for name in (along, up))
-    figure, panels = style.make_grid(
-        len(groups), width=0.95 * len(x) + 0.7, height=0.62 * len(y) + 0.9, extra=0.7,
-        sharex=True, sharey=True,
-    )  # fmt: skip
-    figure.set_figwidth(max(figure.get_figwidth() + 1.8, 5.5))
-    known = points.loc[~points["status"].isin(WORTHLESS), "I_d_std"]
-    most = float(known.max()) if known.any() else 1.0
-    for ax, (held, group) in zip(panels, groups, strict=True):
-        _draw_cells(ax, group.set_index([up, along]), y, x, most)
-        title = [f"{labels[name]}: {value}" for name, value in zip(others, held, strict=True)]
-        ax.set_title(", ".join(title), fontsize=TITLE)
-        ax.set(xlim=(0, len(x)), ylim=(0, len(y)))
-        ax.set_xticks(np.arange(len(x)) + 0.5, x)
-        ax.set_yticks(np.arange(len(y)) + 0.5, y)
-    figure.supxlabel(labels[along], fontsize=TITLE)
-    figure.supylabel(fill(labels[up], 26), fontsize=TITLE, multialignment="center")
-    words = "standard deviation of the\ndischarge current (A)"
-    figure.colorbar(panels[0].collections[0], ax=panels, pad=0.02, label=words)
-    seen = [name for name in HATCHES if (points["status"] == name).any()]
-    if seen:
-        look: dict[str, Any] = {"facecolor": "white", "edgecolor": DATA}
-        style.legend_above(figure, [Patch(hatch=2 * HATCHES[n], label=n, **look) for n in seen])
-    return figure
-
-
-def _draw_cells(
-    ax: Axes, points: pd.DataFrame, rows: Sequence[str], columns: Sequence[str], most: float
-) -> None:
-    """Draw points by their place: amplitude as colour, hatched and labelled if one is quiet."""
-    cells = points.reindex(pd.MultiIndex.from_product([rows, columns]))
-    known = ~cells["status"].isin(WORTHLESS)
-    std, shape = cells["I_d_std"].where(known), (len(rows), len(columns))
-    lines = [std.map("{:.2f} A".format), cells["f_kHz"].where(known).map("{:.1f} kHz".format)]
-    lines += [cells["cycle"].where(cells["status"] == BREATHES, cells["status"]).fillna("nan")]
-    texts = ["\n".join(text for text in of if "nan" not in text) for of in zip(*lines, strict=True)]
-    written = style.draw_cells(ax, std.to_numpy(float).reshape(shape), texts, most)
-    for k, (status, text) in enumerate(zip(cells["status"], written, strict=True)):
-        if hatch := HATCHES.get(status):
-            corner = (k % len(columns), k // len(columns))
-            ax.add_patch(Rectangle(corner, 1, 1, fill=False, ec=GREY, lw=0.8, hatch=hatch))
-            text.set(color="black", bbox={"facecolor": "white", "alpha": 0.85, "lw": 0, "pad": 1.5})
-
-
-def curves_figure(points: pd.DataFrame, along: str, label: str) -> Figure:
-    """Current with its standard deviation, frequency, thrust and efficiency over one parameter.
-
-    points: values or texts in the column `along`, and the columns of CURVES; markers show statuses.
-    """
-    figure, panels = style.make_panels(2, 2, (WIDTH, 5.2), sharex=True)
-    numbers = pd.api.types.is_numeric_dtype(points[along])
-    x = points[along].to_numpy(float) if numbers else np.arange(len(points), dtype=float)
-    for ax, (name, (title, factor)) in zip(panels.flat, CURVES.items(), strict=True):
-        kept = (~points["status"].isin(WORTHLESS)).to_numpy()
-        order = np.argsort(x[kept])
-        values = factor * points[name].to_numpy(float)
-        if numbers:
-            ax.plot(x[kept][order], values[kept][order], color=GREY, lw=1.0, zorder=1)
-        for status, look in STATUS_STYLES.items():
-            here = (points["status"] == status).to_numpy()
-            if status in WORTHLESS:
-                for place in x[here]:
-                    ax.axvline(place, lw=1.0, **look)
-            else:
-                reach = points["I_d_std"][here] if name == "I_d_mean" else None
-                ax.errorbar(x[here], values[here], reach, capsize=3, ms=5, **look)
-        ax.set_title(title, fontsize=TITLE)
-        ax.grid(alpha=0.3)
-        ax.margins(x=0.08)
-        if not numbers:
-            ax.set_xticks(x, points[along])
-    for ax in panels[-1]:
-        ax.set_xlabel(label)
-    seen = {name: look for name, look in STATUS_STYLES.items() if name in set(points["status"])}
-    style.legend_above(figure, [Line2D([], [], label=name, **look) for name, look in seen.items()])
-    return figure

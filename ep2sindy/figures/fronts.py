@@ -44,7 +44,6 @@ def front_figure(
             _draw_front(ax, front, chosen)
         else:
             _draw_scores(ax, front, chosen, label)
-        _add_hovers(ax, front, label)
         ax.set_title(_title(front, label, chosen=chosen is not None), fontsize=TITLE)
     entries = {line.get_label(): line for ax in axes for line in ax.lines}
     shown = [entries[name] for name in _LAYERS if name in entries]
@@ -120,18 +119,6 @@ def _finite(scores: np.ndarray) -> np.ndarray:
     """The scores; infinite or missing ones become ten times the largest finite score."""
     known = scores[np.isfinite(scores)]
     return np.where(np.isfinite(scores), scores, 10.0 * max(known.max(initial=1.0), 1.0))
-
-
-def _add_hovers(ax: Axes, front: ParetoFront, label: str) -> None:
-    """Put an invisible spot over every candidate, whose hover text names it."""
-    heights = np.clip(front.errors, FLOOR, TOP) if front.has_errors else _finite(front.scores)
-    for each, height in zip(front.candidates, heights, strict=True):
-        terms = ", ".join(name.replace("*", " ") for name in each.terms) or "none"
-        text = f"{front.equation}' of {each.n_terms} terms: {terms}"
-        error = f" | 1 - R2 = {height:.3g}" if front.has_errors else ""
-        style.hover_spot(
-            ax, float(each.n_terms), height, f"{text}{error} | {label} = {each.score:.4g}"
-        )
 
 
 def _draw_ensemble(ax: Axes, ensemble: Ensemble, *, label: str) -> None:

@@ -51,21 +51,50 @@ _show_in_notebooks()
 def plot(value: object, *rest: object, **settings: object) -> Figure:
     """Draw one value as a matplotlib figure, as the pages of the experiments show it.
 
-    plot(run, duration_s=None, f_max_Hz=None): the states of a `Trajectory`, a row each, and their
-    power spectra. duration_s: how much of the record is shown; None for twenty periods of the
-    fastest state, or all. f_max_Hz: the end of the spectra; None for ten times its frequency.
-    plot(found): the candidates of every equation of a `Discovery`, the selected ones marked: error
-    against number of terms after a regression, score after a search of trajectories.
-    plot(found.fronts["x"]): the same for one equation.
-    plot(free): the model of an `Evaluation` over its record, the first periods and the last.
-    plot(cycle, run=None): a `LimitCycle` in the plane of the first two states, with runs from other
-    starts. run: samples to draw behind it, of at least these two states.
-    plot(law, records, n_points=25, labels={}): frequency and amplitude of the cycle of an
-    `OperatingLaw` over its one or two parameters. runs: those of the operating points, from
-    whose cycles the law's models are started, and which are drawn as well. n_points: along each
-    parameter. labels: names of the parameters on the axes.
-    Raises TypeError for another value, ValueError for a number that is not positive and for a law
-    of more than two parameters.
+    What is drawn depends on the kind of the value:
+
+    - `plot(run, duration_s=None, f_max_Hz=None)`: the states of a `Trajectory`, a row each, and
+      their power spectra. duration_s is how much of the record is shown, None for twenty periods of
+      the fastest state, or all; f_max_Hz is the end of the spectra, None for ten times its
+      frequency.
+    - `plot(found)`: the candidates of every equation of a `Discovery`, the selected ones marked:
+      error against number of terms after a regression, score after a search of trajectories.
+    - `plot(found.fronts["x"])`: the same for one equation.
+    - `plot(free)`: the model of an `Evaluation` over its record, the first periods and the last.
+    - `plot(cycle, run=None)`: a `LimitCycle` in the plane of the first two states, with runs from
+      other starts, and the samples of `run` behind it.
+    - `plot(law, records, n_points=25, labels={})`: frequency and amplitude of the cycle of an
+      `OperatingLaw` over its one or two parameters, with n_points along each. The cycles of the
+      records of the operating points start the law's models, and are drawn as well. labels are the
+      names of the parameters on the axes.
+
+    Parameters
+    ----------
+    value : object
+        What is drawn.
+    *rest : object
+        Further values, by position.
+    **settings : object
+        Further values, by name.
+
+    Returns
+    -------
+    Figure
+        The figure.
+
+    Raises
+    ------
+    TypeError
+        If there is no drawing of such a value.
+    ValueError
+        If a number is not positive, or a law has more than two parameters.
+
+    Examples
+    --------
+    >>> run = ep.lotka_volterra().trajectory()
+    >>> figure = ep.plot(run, duration_s=20.0)
+    >>> len(figure.axes)  # series and spectrum of x and of y
+    4
     """
     kinds = ", ".join(sorted(kind.__name__ for kind in plot.registry if kind is not object))
     raise TypeError(f"plot draws a {kinds}, got {type(value).__name__}")

@@ -52,7 +52,6 @@ OFF_SCALE, STOPS = "off scale", "diverged"
 
 SIGN = "#555555"  # colour of legend marks, which stand for marks of any colour
 
-HOVER = "hover: "  # prefix of the id of an artist with a hover text, which pages look for
 
 FEW_DECADES = 100.0  # ratio of the ends of a logarithmic axis with ticks inside its decades
 
@@ -173,17 +172,6 @@ def draw_cells(
             np.ndenumerate(np.asarray(scale(values) > DARK)), texts, strict=True
         )
     ]
-
-
-def hover_spot(ax: Axes, x: float, y: float, text: str) -> None:
-    """Put an invisible spot with a hover text over a point; see `hover`."""
-    (spot,) = ax.plot(x, y, "o", ms=13, alpha=0.0, zorder=6, label="_hover")
-    hover(spot, text)
-
-
-def hover(artist: Artist, text: str) -> None:
-    """Add a hover text to an artist, for pages read with a mouse; a bar separates its lines."""
-    artist.set_gid(f"{HOVER}{text}")
 
 
 def axis_label(name: str, unit: str) -> str:

@@ -56,19 +56,40 @@ class HoldsModel(Protocol):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Evaluation:
-    """How a model does on a record: run from one sample, driven by its inputs if it has any.
+    """How a model does on a record: integrated from one sample, driven by its inputs if it has any.
 
     Only the second halves are compared, after transients. If the record does not repeat one
     waveform, or has fewer than eight periods, all of it is compared. Cycle, rest points and
     forecasts are computed when they are first asked for.
 
-    record: the samples that it was run over. status: how the run goes. is_similar: whether it is
-    like the record: sustained, or, without a cycle to compare, with its envelope, or with its means
-    and amplitudes. f_error: relative error of the frequency. amplitude_ratio, waveform_error: by
-    state, the last in standard deviations. They are NaN for a run that diverged; frequency and
-    waveform errors are also NaN if the record or the run has no period. lack_of_fit: why the model
-    does not explain the data it was found from; empty if it does, or if that is not known.
-    forecasts: makes `forecast`; None without held-out samples.
+    Parameters
+    ----------
+    model : SparseModel
+        The equations.
+    record : Trajectory
+        The samples over which the model was integrated.
+    rollout : Rollout
+        The run of the model.
+    compared : ComparedRecord
+        The part of the record that is compared.
+    status : Status
+        How the run goes.
+    is_similar : bool
+        Whether the run is like the record: sustained, or, without a cycle to compare, with its
+        envelope, or with its means and amplitudes.
+    f_error : float
+        Relative error of the frequency. NaN for a run that diverged, or if the record or the run
+        has no period.
+    amplitude_ratio : mapping of str to float
+        Standard deviation of each state relative to the record's. NaN for a run that diverged.
+    waveform_error : mapping of str to float
+        Difference of the waveforms of each state, in standard deviations. NaN for a run that
+        diverged, or if the record or the run has no period.
+    lack_of_fit : str, default ''
+        Why the model does not explain the data it was found from. Empty if it does, or if that is
+        not known.
+    forecasts : callable, optional
+        Makes `forecast`. None without held-out samples.
     """
 
     model: SparseModel
@@ -321,15 +342,45 @@ def evaluate(
     assessed: Sequence[str] | None = None,
     n_fitted: int | None = None,
 ) -> Evaluation:
-    """Run a model over a record, or its first samples, and compare the attractors.
+    """Integrate a model over a record and compare the attractors of both.
 
-    model: a SparseModel, or a Discovery, whose lack of fit is then reported. run: a Trajectory, or
-    what `discover` takes as one run. initial: the state to start from, in SI; None takes the
-    data's. n_samples: of the run that are compared; None takes all. assessed: states that determine
-    the status and f_error, such as the measured one; None takes all. n_fitted: samples at the start
-    that the model was fitted to; it is then run over the rest, from the last of these, and
-    forecasts of the rest are counted. Raises ValueError for a assessed state that the model does
-    not have, or too few samples.
+    The result states whether the model sustains the record's oscillation, with its frequency,
+    amplitudes and waveform, and how stable its cycle is.
+
+    Parameters
+    ----------
+    model : SparseModel, or Discovery
+        The model. The lack of fit of a discovery is reported as well.
+    run : run
+        A Trajectory, or whatever `discover` takes as one run.
+    initial : (n_states,) array, optional
+        State to start from, in SI. None takes the data's first sample.
+    n_samples : int, optional
+        Number of samples of the run that are compared. None takes all.
+    bounds : FreeRunBounds, optional
+        Largest deviations at which the run counts as sustained.
+    assessed : sequence of str, optional
+        States that determine the status and the frequency error, such as the measured one. None
+        takes all.
+    n_fitted : int, optional
+        Number of samples at the start that the model was fitted to. It is then integrated over the
+        rest, from the last of these, and forecasts of the rest are counted.
+
+    Returns
+    -------
+    Evaluation
+        The status, the deviations, and on demand cycle, rest points and forecasts.
+
+    Raises
+    ------
+    ValueError
+        If an assessed state is not in the model, or there are too few samples.
+
+    Examples
+    --------
+    >>> run = ep.lotka_volterra().trajectory(noise=0.02, rng=0)
+    >>> str(ep.evaluate(ep.lotka_volterra().model, run).status)
+    'sustained'
     """
     lack_of_fit, forecasts = "", None
     if isinstance(model, HoldsModel):

@@ -163,26 +163,58 @@ def forecast(
 ) -> Forecast:
     """Forecast from the end of a history, whose last periods determine the start.
 
-    The model itself is fitted to the samples of the last four periods: nothing but the past enters.
-    The noise of the samples is the likeliest one for the record that the model was fitted to, and
-    process noise, for what the model does not describe, is that or a part of it. The bands follow
-    from the uncertainty of the start, from the covariance of the model's coefficients if it has
-    one, from this process noise, and from the noise; they are as many times wider as the errors of
-    forecasts within that record say (`calibrate`).
-    history: samples of the measured states and of the inputs; a Trajectory, a table or (t, x).
-    States of the model that it lacks are distinguished from the others (`estimate_states`).
-    horizon: duration in s, in steps of the history; or the times (samples,) themselves, in s.
-    fitted_to: the record that the model was fitted to; None takes the history. measured: states
-    that were measured; others that the history has were made from them (`ep.embed`), and
-    only start the fit.
-    inputs: of a driven model over the horizon, as for `simulate`.
-    Raises ValueError for a history without any state or some input of the model, or a horizon that
-    does not lie ahead.
+    The start is fitted to the samples of the last four periods by the model itself, so that nothing
+    but the past enters. The bands follow from the uncertainty of this start, the covariance of the
+    model's coefficients if it has one, process noise for what the model does not describe, and the
+    noise of the samples. They are as many times wider as the errors of forecasts within the fitted
+    record require (`calibrate`).
 
-    >>> run = ep.lorenz().trajectory(noise=0.05, rng=0)
-    >>> ahead = ep.forecast(ep.lorenz().model, run.window(0, 2000), 0.5)
+    Parameters
+    ----------
+    model : SparseModel
+        The equations.
+    history : run
+        Samples of the measured states and of the inputs. States of the model that it lacks are
+        estimated from the others (`ep.model.estimate_states`).
+    horizon : float or (samples,) array
+        Duration in s, in steps of the history; or the times themselves, in s.
+    fitted_to : run, optional
+        The record that the model was fitted to, from which the noise is estimated. None takes the
+        history.
+    measured : sequence of str, optional
+        States that were measured. Others that the history has were made from them (`ep.embed`), and
+        only start the fit.
+    inputs : array-like or mapping of str to any, optional
+        Inputs of a driven model over the horizon, as for `SparseModel.simulate`.
+    n_draws : int, default 200
+        Number of runs of which the bands are made.
+    seed : int, default 0
+        Of the random draws.
+
+    Returns
+    -------
+    Forecast
+        Median and draws of the states at the times of the horizon. `band(level)` gives their
+        bounds.
+
+    Raises
+    ------
+    ValueError
+        If the history has no state of the model or lacks an input, or the horizon does not lie
+        ahead.
+
+    Notes
+    -----
+    The start x_0 and the size of the process noise are the most likely ones of a Kalman smoother
+    whose mean follows the model, y_k = x_k + noise, x_(k+1) = F(x_k) + process noise.
+
+    Examples
+    --------
+    >>> system = ep.lotka_volterra()
+    >>> run = system.trajectory(noise=0.02, rng=0)
+    >>> ahead = ep.forecast(system.model, run.window(0, 300), 2.0, n_draws=50)
     >>> low, high = ahead.band(0.9)
-    >>> inside = (low <= run.states[2000:2150]) & (run.states[2000:2150] <= high)
+    >>> inside = (low <= run.states[300:320]) & (run.states[300:320] <= high)
     >>> bool(0.8 < inside.mean() <= 1.0)
     True
     """

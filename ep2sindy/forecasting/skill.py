@@ -260,15 +260,42 @@ def forecast_skill(
     seed: int = 0,
     progress: Progress | bool = False,
 ) -> ForecastSkill:
-    """Forecast a held-out part again and again, each time from its own past, and count the errors.
+    """Forecast a held-out part repeatedly, each time from its own past, and count the errors.
 
-    run: a record of all states and inputs of the model; its first `n_fitted` samples were fitted,
-    and also serve the baselines. starts: number of starts, evenly spread over the rest. horizon_s:
-    the longest horizon; None takes four periods, or what half of the rest allows. measured: as for
-    `forecast`. states_of: makes the states of a past whose first columns are the measured ones
-    (`ep.embed`). estimator: calibrated on the fitted part. n_draws: of every forecast.
-    Inputs of a model are known ahead, also to the autoregression.
-    Raises ValueError for a part that is too short, or a record without an input.
+    Parameters
+    ----------
+    model : SparseModel
+        The equations. Inputs are known ahead, also to the autoregression.
+    run : run
+        A record of all states and inputs of the model.
+    n_fitted : int
+        Number of samples at its start that were fitted, and that also serve the baselines.
+    starts : int, default N_STARTS
+        Number of starts, evenly spread over the rest.
+    horizon_s : float, optional
+        The longest horizon in s. None takes four periods, or what half of the rest allows.
+    measured : sequence of str, optional
+        States that were measured, as for `ep.forecast`.
+    states_of : StatesOf, optional
+        Makes the states of a past whose first columns are the measured ones (`ep.embed`).
+    n_draws : int, default 100
+        Number of runs in every forecast.
+    estimator : StateEstimator, optional
+        State estimator calibrated on the fitted part. None calibrates one.
+    seed : int, default 0
+        Of the random draws.
+    progress : Progress or bool, default False
+        True shows a bar.
+
+    Returns
+    -------
+    ForecastSkill
+        Errors by horizon, of the model and of the baselines.
+
+    Raises
+    ------
+    ValueError
+        If the held-out part is too short, or the record lacks an input.
     """
     record, watch = trajectory_of(run), as_progress(progress)
     check_fitted(record, n_fitted)

@@ -230,14 +230,38 @@ def tune_estimator(
 def estimate_states(
     model: SparseModel, run: Run, *, measured: Sequence[str] | None = None
 ) -> Trajectory:
-    """All states of a model along a record, those included that nobody measured.
+    """All states of a model along a record, including those that nobody measured.
 
-    The states follow the model but for process noise, and the samples but for noise; the sizes of
-    both are the likeliest ones for this record (Kalman smoothing, iterated).
-    run: has the inputs and some states of the model. measured: as for `tune_estimator`.
-    Raises ValueError for a run without any state of the model, or a state that the model cannot
-    tell from the others.
+    Parameters
+    ----------
+    model : SparseModel
+        The equations.
+    run : run
+        A record with the inputs and some states of the model.
+    measured : sequence of str, optional
+        States that were measured. None takes all that the record has.
 
+    Returns
+    -------
+    Trajectory
+        All states of the model at the times of the record.
+
+    Raises
+    ------
+    ValueError
+        If the record has no state of the model, or a state cannot be distinguished from the others.
+
+    Notes
+    -----
+    The states minimise
+
+        sum_k |(y_k - x_k) / sigma|^2 + sum_k |(F(x_k) - x_(k+1)) / q|^2
+
+    with the flow F of the model over one step (Kalman smoothing, iterated). The noise sigma and the
+    process noise q are the likeliest ones for this record.
+
+    Examples
+    --------
     >>> full = ep.lotka_volterra().trajectory(noise=0.05, rng=0)
     >>> predators = ep.Trajectory(full.t, full.columns(["y"]), ["y"])
     >>> both = ep.model.estimate_states(ep.lotka_volterra().model, predators)

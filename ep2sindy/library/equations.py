@@ -10,7 +10,6 @@ from html.entities import name2codepoint
 from types import MappingProxyType
 from typing import TYPE_CHECKING, TypeAlias
 
-from ep2sindy.library.functions import number_sympy
 from ep2sindy.library.names import RECIPROCAL, Part, split_term
 from ep2sindy.library.processes import Group
 
@@ -208,13 +207,20 @@ def sum_sympy(terms: Mapping[str, float]) -> sympy.Expr:
     )
 
 
+def _number_sympy(value: float) -> sympy.Expr:
+    """A number as sympy keeps it: whole ones as integers, so that x^2 stays a square."""
+    import sympy
+
+    return sympy.Integer(int(value)) if value.is_integer() else sympy.Float(value)
+
+
 def factor_sympy(part: Part) -> sympy.Expr:
     """One factor of a term, without its power, as a sympy expression."""
     import sympy
 
     argument = sympy.Symbol(part.variable)
     if not part.is_bare:
-        argument = number_sympy(part.scale) * argument + number_sympy(part.shift)
+        argument = _number_sympy(part.scale) * argument + _number_sympy(part.shift)
     if not part.function:
         return argument
     if part.function == RECIPROCAL:

@@ -7,12 +7,10 @@ log(n_i / 1 m^-3).
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import cache, partial
 from math import isfinite
-from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from array_api_compat import array_namespace, is_numpy_array
@@ -20,9 +18,6 @@ from jaxtyping import Bool, Float
 
 from ep2sindy.library.names import RECIPROCAL, Part, number_text
 from ep2sindy.library.units import unit_product
-
-if TYPE_CHECKING:
-    import sympy
 
 Values = Callable[[Any], Any]
 Interval = tuple[float, float]
@@ -221,22 +216,36 @@ def variable_factor(name: str) -> Function:
 def register_function(
     name: str,
     value: Values,
-    derivative: Values | None = None,
+    derivative: Values,
     *,
     domain: Interval = (-np.inf, np.inf),
 ) -> None:
     """Register a function of your own, so that terms can use it: `tanh(x)` or `tanh(2*x)`.
 
-    value, derivative: take a NumPy array and return an array of the same shape, element by element;
-    PyTorch needs nothing more. None derives a formula of NumPy's arithmetic and functions by sympy.
-    domain: an open interval in which both are finite.
     Models store only the name, so register the function before you load one. Registering a name
     again replaces the function from then on.
-    Raises ValueError for a name that is not a plain word or is built in, a domain that is not an
-    interval, values of another shape or not finite, a wrong derivative, or none of what is no
-    formula.
 
-    >>> ep.register_function("tanh", np.tanh)
+    Parameters
+    ----------
+    name : str
+        A plain word that is not the name of a built-in function.
+    value : callable
+        Takes a NumPy array and returns an array of the same shape, element by element. PyTorch
+        needs nothing more.
+    derivative : callable
+        The derivative of `value`, in the same form.
+    domain : (float, float), default (-inf, inf)
+        Open interval in which both are finite.
+
+    Raises
+    ------
+    ValueError
+        If the name is not a plain word or is built in, the domain is not an interval, values have
+        another shape or are not finite, or the derivative is wrong.
+
+    Examples
+    --------
+    >>> ep.register_function("tanh", np.tanh, lambda x: 1.0 - np.tanh(x) ** 2)
     >>> ep.polynomial(["x"], degree=1, functions=["tanh"]).names
     ('1', 'x', 'tanh(x)')
     """
@@ -247,11 +256,6 @@ def register_function(
     low, high = map(float, domain)
     if not low < high:
         raise ValueError(f"a domain must be an interval (low, high), got {domain}")
-    if derivative is None:
-        needs = f"a derivative is found by itself for {FORMULA}: {name!r} is none"
-        hint = f"give it, as in ep.register_function({name!r}, value, derivative)"
-        _record(value, (low, high), needs, hint)
-        derivative = partial(_evaluate_slope, value, (low, high))
     _check_derivative(name, value, derivative, low, high)
     _kinds[name] = Kind(name, value, derivative, ((low, high),), own=True)
 
@@ -297,102 +301,6 @@ def points_inside(low: float, high: float) -> Float[np.ndarray, " points"]:
     if np.isfinite(low):
         return low + away
     return high - away if np.isfinite(high) else away - 1.5
-
-
-# A registered function as a formula: what it computes is recorded while it is called once.
-
-
-def _record(
-    value: Values, domain: Interval, needs: str = "", hint: str = ""
-) -> tuple[sympy.Symbol, sympy.Expr]:
-    """A symbol, and what a function computes of it, checked at a few points of its domain.
-
-    needs, hint: of the ValueError that is raised, with the reason, if it is no formula.
-    """
-    import sympy  # imported here because it takes half a second and most runs do not need it
-
-    x = sympy.Dummy("x", real=True)
-    try:
-        found = _unwrap(value(Recorded(x)))
-        points = points_inside(*domain)
-        numbers = [float(found.subs(x, point)) for point in points.tolist()]
-        if not np.allclose(numbers, value(points), rtol=1e-9, atol=0.0):
-            raise ValueError(f"as a formula it has other values, {numbers}")
-    except (TypeError, ValueError, AttributeError, ArithmeticError, IndexError) as error:
-        raise ValueError(f"{needs} ({error!s:.150}); {hint}") from error
-    return x, found
-
-
-def _evaluate_slope(value: Values, domain: Interval, x: np.ndarray) -> np.ndarray:
-    """The derivative of a formula at an array; a partial of it is pickled by the formula."""
-    return np.zeros(x.shape) + _slope_of(value, domain)(x)  # that of x is one, whatever the shape
-
-
-@cache
-def _slope_of(value: Values, domain: Interval) -> Values:
-    import sympy
-
-    x, found = _record(value, domain)
-    slope: Values = sympy.lambdify(x, sympy.diff(found, x), "numpy")
-    return slope
-
-
-class Recorded(np.lib.mixins.NDArrayOperatorsMixin):
-    """A sympy expression in the place of an array: NumPy's functions of it give expressions."""
-
-    def __init__(self, expression: sympy.Expr) -> None:
-        self.expression = expression
-
-    def __getattr__(self, name: str) -> Any:
-        raise AttributeError(f"it uses .{name}")
-
-    def __array_ufunc__(self, ufunc: np.ufunc, method: str, *args: Any, **settings: Any) -> Any:
-        import sympy
-
-        name = ufunc.__name__
-        if method != "__call__" or settings or name not in {*ARITHMETIC, *SYMPY_NAMES}:
-            used = f"np.{name}" if method == "__call__" else f"np.{name}.{method}"
-            raise TypeError(f"it uses {used}")
-        # NumPy applies arithmetic to any objects, one by one.
-        of = ufunc if name in ARITHMETIC else getattr(sympy, SYMPY_NAMES[name])
-        return Recorded(of(*map(_unwrap, args)))
-
-
-# NumPy's arithmetic, and its functions with the names that sympy has for them.
-ARITHMETIC = frozenset(
-    [
-        "add",
-        "subtract",
-        "multiply",
-        "divide",
-        "power",
-        "negative",
-        "positive",
-        "square",
-        "reciprocal",
-    ]
-)
-SYMPY_NAMES: Mapping[str, str] = MappingProxyType(
-    {name: name for name in ("sqrt", "exp", "log", "sin", "cos", "tan", "sinh", "cosh", "tanh")}
-    | {"arcsin": "asin", "arccos": "acos", "arctan": "atan", "absolute": "Abs"}
-)
-
-
-FORMULA = (
-    "a formula of + - * / ** and "  # what can be recorded, in words
-    + ", ".join(f"np.{name}" for name in SYMPY_NAMES)
-)
-
-
-def _unwrap(value: Any) -> sympy.Expr:
-    return value.expression if isinstance(value, Recorded) else number_sympy(float(value))
-
-
-def number_sympy(value: float) -> sympy.Expr:
-    """A number as sympy keeps it: whole ones as integers, so that x^2 stays a square."""
-    import sympy
-
-    return sympy.Integer(int(value)) if value.is_integer() else sympy.Float(value)
 
 
 def _receive(name: str, own: tuple[Values, Values, tuple[Interval, ...]] | None = None) -> Kind:

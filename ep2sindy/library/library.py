@@ -33,16 +33,37 @@ from ep2sindy.runtime.values import check_list
 
 @dataclass(frozen=True, eq=False)
 class Library:
-    """Ordered candidate terms, each a product of powers of `variables` and of `functions` of them.
+    """Ordered candidate terms, each a product of powers of variables and of functions of them.
 
-    exponents: (terms, variables then functions), non-negative integers; a row of zeros is the
-    constant. functions: the factors that are not variables; without them every term is a monomial.
-    facts: what is known of the equations, as `relate`, `only`, `exclude`, `known` and `with_roles`
-    say it; each returns a new library. Models keep the terms alone, and so does `take`.
-    Term names read `1`, `n_i`, `n_i*n_n`, `n_i^2`, with factors in the order of `variables`.
-    Raises ValueError for repeated variables or terms, an invalid variable name, no term, or facts
-    of unknown terms.
+    A library also holds facts, that is, what is known of the equations. `relate`, `only`,
+    `exclude`, `known` and `with_roles` each return a new library with one more fact. Models keep
+    only the terms, and so does `take`. `polynomial` and `named_terms` make libraries.
 
+    Parameters
+    ----------
+    variables : sequence of str
+        Names of the variables, states first.
+    exponents : (terms, factors) int array
+        Powers of the variables, then of the functions, in each term. They are not negative. A row
+        of zeros is the constant.
+    functions : sequence of Function, default ()
+        The factors that are not variables. Without them every term is a monomial.
+    facts : Facts, default Facts()
+        What is known of the equations.
+
+    Raises
+    ------
+    ValueError
+        If a variable or a term is repeated, a variable's name is invalid, there is no term, or a
+        fact names an unknown term.
+
+    Notes
+    -----
+    Term k is the product of `x_j^exponents[k, j]` over the variables and functions x_j. Names of
+    terms are `1`, `n_i`, `n_i*n_n`, `n_i^2`, with factors in the order of the variables.
+
+    Examples
+    --------
     >>> library = ep.polynomial(["x", "y"], degree=2).exclude({"x": ["x^2"]})
     >>> library.relate("x: x*y == -1 * y: x*y")
     Library of 6 terms over x, y
@@ -92,7 +113,7 @@ class Library:
         return replace(joined, facts=self.facts | other.facts)
 
     def relate(self, *relations: Relation | str) -> Library:
-        """With linear relations between coefficients, "x: x*y == -1 * y: x*y" or "x: y == 1".
+        """With linear relations of coefficients, `"x: x*y == -1 * y: x*y"` or `"x: y == 1"`.
 
         They hold in the search, in the selection and in the model; numbers are in SI.
         """
@@ -267,8 +288,15 @@ class Library:
     def evaluate(self, values: Any) -> Any:
         """Evaluate every term at every sample.
 
-        values: (..., variables), a NumPy array or a torch tensor, in the order of `variables`.
-        Returns (..., terms), of the same kind.
+        Parameters
+        ----------
+        values : array or torch tensor (..., variables)
+            Samples, in the order of `variables`.
+
+        Returns
+        -------
+        (..., terms) array or torch tensor
+            The terms, of the same kind.
         """
         check_values(len(self), values.shape)
         xp = array_namespace(values)
@@ -392,7 +420,30 @@ def functions_of_point(
 
 
 def named_terms(variables: Sequence[str], names: Sequence[str]) -> Library:
-    """Library of exactly these terms, in this order."""
+    """Library of exactly the named terms, in this order.
+
+    Parameters
+    ----------
+    variables : sequence of str
+        Names of the variables, states first.
+    names : sequence of str
+        Names of the terms, such as `1`, `x*y`, `x^2` or `sin(x)`.
+
+    Returns
+    -------
+    Library
+        The terms.
+
+    Raises
+    ------
+    ValueError
+        If a term is repeated, or has an unknown variable or function.
+
+    Examples
+    --------
+    >>> ep.named_terms(["x", "y"], ["x", "x*y"]).names
+    ('x', 'x*y')
+    """
     check_list("variables", variables)
     check_list("names", names)
     check_exponents(len(names), len(variables))
@@ -410,14 +461,41 @@ def polynomial(
     functions: Sequence[str] = (),
     function_degree: int = 1,
 ) -> Library:
-    """All products of `variables` up to `degree`, including the constant, then `products`.
+    """Library of all products of the variables up to a degree, including the constant.
 
-    products: further terms by name. functions: a bare name such as `sin` applies to every variable;
-    one written out, such as `sin(2*x)` or `1/(0.5+x)`, is taken as it is. function_degree: largest
-    number of factors in a term with a function. 1 gives functions alone, 2 also their products with
-    a variable or with each other.
-    Terms are ordered by degree, then by variable, functions last: 1, x, y, sin(x), x^2, ...
-    Raises ValueError for a wrong degree, or for an unknown variable or function.
+    Terms are ordered by degree, then by variable, with functions last: 1, x, y, sin(x), x^2, ...
+
+    Parameters
+    ----------
+    variables : sequence of str
+        Names of the variables, states first.
+    degree : int, default 2
+        Largest number of factors in a product of variables.
+    products : sequence of str, default ()
+        Further terms by name, such as "x^3".
+    functions : sequence of str, default ()
+        A bare name such as `sin` applies to every variable. A function that is written out, such as
+        `sin(2*x)` or `1/(0.5+x)`, is taken as it is.
+    function_degree : int, default 1
+        Largest number of factors in a term with a function: 1 gives functions by themselves, 2 also
+        their products with a variable or with each other.
+
+    Returns
+    -------
+    Library
+        The terms.
+
+    Raises
+    ------
+    ValueError
+        If a degree is negative or not a whole number, or a variable or function is unknown.
+
+    Examples
+    --------
+    >>> ep.polynomial(["x", "y"], degree=2).names
+    ('1', 'x', 'y', 'x^2', 'x*y', 'y^2')
+    >>> ep.polynomial(["x"], degree=1, functions=["sin"]).names
+    ('1', 'x', 'sin(x)')
     """
     check_list("variables", variables)
     check_list("products", products)

@@ -156,9 +156,30 @@ def constraint(
 
     The coefficient with the largest factor is eliminated; among equal factors, the one whose first
     mention in the relations comes last.
-    Raises ValueError for a relation that contradicts or repeats earlier ones, names an unknown
-    state or term, or names a term outside the support; the error quotes the relation.
 
+    Parameters
+    ----------
+    library : NamedTerms
+        The terms.
+    support : mapping of str to sequence of str
+        Terms of the equation of each state.
+    relations : sequence of Relation or str, default ()
+        Linear relations between coefficients, such as `"x: x*y == -1 * y: x*y"` or `"x: y == 1"`,
+        in SI.
+
+    Returns
+    -------
+    Constraint
+        Matrix C and vector d of coef = C z + d, where z holds the free coefficients.
+
+    Raises
+    ------
+    ValueError
+        If a relation contradicts or repeats earlier ones, names an unknown state or term, or names
+        a term outside the support. The error quotes the relation.
+
+    Examples
+    --------
     >>> library = ep.polynomial(["x", "y"], degree=2)
     >>> support = {"x": ["x", "x*y"], "y": ["y", "x*y"]}
     >>> ep.library.constraint(library, support, ["x: x*y == -1 * y: x*y"]).C.shape

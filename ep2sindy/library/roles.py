@@ -45,36 +45,62 @@ class Role(NamedTuple):
 
 @dataclass(frozen=True)
 class Roles:
-    """Roles that terms have, for a search that conserves what states exchange.
+    """Roles of terms, for a search whose equations conserve what the states exchange.
 
-    exchange: pairs (from, to); a term in this role leaves the first equation and enters the second
-    with the same coefficient. Where several bodies take part, a side names them all, as a reaction
-    does: ("E + S", "ES"), or ("A + X", "X + X"). outflow: states that lose something to the
-    outside. inflow: state -> what it is supplied with, a constant. A state without a role has an
-    equation of free terms.
+    A role states what a term may do: it moves something from one state to another (exchange),
+    removes it (outflow) or supplies it (inflow). A state without a role has an equation of free
+    terms.
 
-    Any term of the library may be exchanged, with a coefficient of either sign, and the powers of a
-    state may flow out, each of which takes away. With `nonnegative`, states are numbers of bodies,
-    or densities, and terms obey mass action: what lowers a state contains it as a factor. An
-    exchange then takes terms that contain its first state, and moves them forward; terms that
-    contain the second state, but not the first, go back, unless that way is an exchange of its own.
-    Terms that are named for a role must contain its first state, too. Terms of a reaction contain
-    every body that reacts, as often as it does. All coefficients are
-    positive, and so no state can turn negative.
+    Any term of the library may be exchanged, with a coefficient of either sign, and powers of a
+    state may leave, with coefficients that take away. With `nonnegative`, states are numbers of
+    bodies or densities, and terms obey mass action: what lowers a state contains it as a factor.
+    Terms that contain the first state of an exchange then move forward; terms that contain the
+    second state, but not the first, move back, unless that direction is an exchange of its own.
+    Terms named for a role must contain its first state, too. Terms of a reaction contain every
+    reacting body as often as it reacts. All coefficients are positive, so that no state can become
+    negative.
 
-    A third entry of an exchange, and the values of outflow, if it is a mapping, say how: "free", as
-    above; a list of the terms that may; a mapping term -> coefficient in SI, where it is known; or
-    "known" and "known or free", for which an experiment puts what the record itself gives. An
-    inflow is a number in SI per second, one of these words, or a list of terms, such as births by
-    the state itself.
-    sizes: state -> length or volume that it is an average over; what leaves a small place changes a
-    large one by less. Absent ones are one. equations: state -> terms with their coefficients in SI,
-    where the equation is known and nothing is to be found; the library need not hold these terms.
-    forward: True if in the mean over the records every role must move more forward than back, as
-    in several zones.
-    Raises ValueError for an exchange of a side with itself, a size that is not positive, or a role
-    of a state whose equation is known.
+    Parameters
+    ----------
+    exchange : sequence of (from, to) or (from, to, how)
+        A term in this role leaves the first equation and enters the second with the same
+        coefficient. If several bodies take part, a side names them all, as a reaction does:
+        ("E + S", "ES") or ("A + X", "X + X").
+    outflow : sequence of str or mapping of str to how
+        States that lose something to the outside.
+    inflow : mapping of str to how
+        What each state is supplied with: a number in SI per second, "free", "known",
+        "known or free", or a list of terms, such as births by the state itself.
+    nonnegative : bool, default False
+        True if states cannot be negative and terms obey mass action.
+    sizes : mapping of str to float, default {}
+        Length or volume over which each state is an average, since what leaves a small volume
+        changes a large one by less. Absent sizes are one.
+    equations : mapping of str to mapping of str to float, default {}
+        Terms with their coefficients in SI of each state whose equation is known. The library need
+        not hold these terms.
+    forward : bool, default False
+        True if every role must move more forward than back in the mean over the records, as between
+        zones.
 
+    Raises
+    ------
+    ValueError
+        If both sides of an exchange are the same, a size is not positive, a role is given twice, or
+        a state has both a role and a known equation.
+
+    Notes
+    -----
+    An exchange of term f from a to b with coefficient c adds
+
+        a' = ... - c f,   b' = ... + c f size_a / size_b
+
+    The `how` of a role is "free" (any term, the default), a list of the terms that may play it, a
+    mapping from term to its known coefficient in SI, or "known" and "known or free", which an
+    experiment replaces by what the record itself gives.
+
+    Examples
+    --------
     >>> roles = ep.Roles(exchange=[("prey", "predator")], outflow=["predator"], nonnegative=True)
     >>> library = ep.polynomial(["prey", "predator"], degree=2)
     >>> [f"{p.role}: {p.term}" for p in roles.processes(library, ["prey", "predator"])][:3]
@@ -205,16 +231,30 @@ class Roles:
         )
 
     def in_zones(self, sizes: Mapping[str, float]) -> Roles:
-        """These roles in adjoining zones of one place, in the order in which the states move on.
+        """These roles in adjoining zones, in the order in which the states move on.
 
-        sizes: zone -> its length or volume. States become those of `zone_averages`, `n_i@exit`.
-        What states exchange in a zone, they exchange by their product, alone or times one more
+        What states exchange in a zone, they exchange by their product, by itself or times one more
         density of the zone or of the giver in a neighbouring zone. Every state with a role moves
-        from each zone to the next by terms that it is a factor of, alone or times one other density
-        of its zone or its own in the next one. It enters the first zone and leaves the last. In the
-        mean all of them go forward. A number as inflow is that of all zones together, as if they
-        were one.
-        Raises ValueError for terms, which are of one zone's equations.
+        from each zone to the next by terms that it is a factor of, by itself or times one other
+        density of its zone or its own in the next one. It enters the first zone and leaves the
+        last. In the mean all of them go forward. A number as inflow is that of all zones together,
+        as if they were one.
+
+        Parameters
+        ----------
+        sizes : mapping of str to float
+            Length or volume of each zone. States become those of `zone_averages`, such as
+            `n_i@exit`.
+
+        Returns
+        -------
+        Roles
+            The roles of all zones.
+
+        Raises
+        ------
+        ValueError
+            If the roles name terms, which belong to one zone's equations.
         """
         named = [role.giver or not isinstance(role.how, str | Mapping) for role in self._roles]
         several = any("+" in role.name for role in self._roles)

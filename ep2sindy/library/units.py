@@ -191,7 +191,14 @@ def calendar_unit(step_s: float) -> str:
 class Clock:
     """Unit in which times are displayed, such as years; all values and files stay in seconds.
 
-    Seconds are displayed with SI prefixes, as 71 µs and 14.1 kHz. seconds: length of the unit in s.
+    Seconds are displayed with SI prefixes, as 71 µs and 14.1 kHz.
+
+    Parameters
+    ----------
+    unit : str, default 's'
+        Name of the unit.
+    seconds : float, default 1.0
+        Length of the unit in s.
     """
 
     unit: str = "s"

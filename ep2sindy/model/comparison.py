@@ -38,11 +38,14 @@ FIRST_PERIOD, TOO_NOISY = 0.3, 0.1
 class Status(StrEnum):
     """How a model's run goes next to a record, the best first.
 
-    sustained: it stays on the record's cycle. wrong frequency: amplitudes and waveform are the
-    record's, and the frequency is not, or the run misses the record in the first period already.
-    no cycle to compare: the record grows, decays or does not repeat itself; `is_similar` says
-    whether the run has its envelope, or its means and amplitudes. How far it forecasts such a
-    record, `Evaluation.forecast` says.
+    - sustained: the run stays on the record's cycle.
+    - wrong frequency: amplitudes and waveform are the record's, and the frequency is not, or the
+      run misses the record in the first period already.
+    - wrong cycle: the run oscillates with other amplitudes or another waveform.
+    - no cycle to compare: the record grows, decays or does not repeat itself. `is_similar` states
+      whether the run has its envelope, or its means and amplitudes; `Evaluation.forecast` states
+      how far the model forecasts such a record.
+    - decays, turns negative, leaves the domain (of a function of the model), diverges.
     """
 
     SUSTAINED = "sustained"
@@ -59,11 +62,23 @@ class Status(StrEnum):
 class FreeRunBounds:
     """Largest deviations from the data at which a run still counts as sustained.
 
-    frequency, amplitude: relative error of the frequency and of each state's standard deviation.
-    waveform: RMS difference of the waveforms, in standard deviations; of records that do not repeat
-    themselves, the difference of the means.
+    If a third of a record that does not repeat itself is farther from the whole, that distance is
+    the bound instead.
 
-    If a third of such a record is farther from the whole, that distance is the bound instead.
+    Parameters
+    ----------
+    frequency : float, default 0.01
+        Relative error of the frequency.
+    amplitude : float, default 0.1
+        Relative error of the standard deviation of each state.
+    waveform : float, default 0.2
+        RMS difference of the waveforms, in standard deviations. For records that do not repeat
+        themselves, the difference of the means.
+
+    Raises
+    ------
+    ValueError
+        If a bound is not positive.
     """
 
     frequency: float = 0.01

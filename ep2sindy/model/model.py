@@ -40,14 +40,45 @@ if TYPE_CHECKING:
 class SparseModel:
     """Equations x' = library(states, inputs) coef, in SI units.
 
-    coef: (terms, equations), zero outside the support. states: one name per equation.
-    units: of the states and of the library's variables. provenance: origin of the model.
-    covariance: (coefs, coefs) of the nonzero coefficients, in SI, ordered by equation and within
-    each equation in the order of the library; None if it is not known. clock: unit of time in which
-    the equations are shown; coefficients stay in SI. courses: input -> how it goes from one sample
-    to the next, "held" (at the value of the last one), "linear" or "smooth" (a cubic spline). An
-    input without one is held if its samples rest over most steps, and else smooth.
+    A model integrates (`simulate`, `rollout`), evaluates its right-hand side (`predict`), prints,
+    and is saved as JSON. Its arrays cannot be changed.
 
+    Parameters
+    ----------
+    library : Library
+        The terms. Facts of the equations are dropped.
+    states : sequence of str
+        One name per equation.
+    coef : (terms, equations) array
+        Coefficients in SI, zero outside the support.
+    units : mapping of str to str, default {}
+        Units of the states and of the library's variables. A name that is absent has the unit "1".
+    provenance : mapping of str to str, default {}
+        Record of how the model was found.
+    covariance : (coefs, coefs) array, optional
+        Covariance of the nonzero coefficients in SI, ordered by equation and within each equation
+        in the order of the library. None if it is not known.
+    clock : Clock, default SECONDS
+        Unit of time in which the equations are displayed. Coefficients stay in SI.
+    courses : mapping of str to str, default {}
+        How each input goes from one sample to the next: "held" (at the value of the last one),
+        "linear" or "smooth" (a cubic spline). Other inputs are held if their samples rest over most
+        steps, and else smooth.
+
+    Raises
+    ------
+    ValueError
+        If states repeat, coefficients have another shape or are not finite, or the covariance has
+        another shape.
+
+    Notes
+    -----
+    The right-hand side is
+
+        x_s' = sum_j coef[j, s] theta_j(x, u)
+
+    Examples
+    --------
     >>> library = ep.polynomial(["x", "v"], degree=1)
     >>> spring = ep.model.coef_matrix(library, [{"v": 1.0}, {"x": -4.0}])
     >>> print(ep.SparseModel(library, ["x", "v"], spring).text())
@@ -165,13 +196,37 @@ class SparseModel:
     ) -> Rollout:
         """Integrate from one sample of a trajectory, driven by its inputs (see `courses`).
 
-        trajectory: a Trajectory, a table or arrays (t, x), as `discover` takes them.
-        initial: the state at that sample, in SI; None takes the data's.
-        The states are scaled by their largest value in the window, so that one tolerance fits
-        all. A state that exceeds `blow_up` times that value ends the run as diverged. If the
-        equations are stiff, the solver switches to an implicit method. The run also ends, marked
+        The states are scaled by their largest value in the window, so that one tolerance fits all.
+        If the equations are stiff, the solver switches to an implicit method. The run ends, marked
         and with a message, after some hundred evaluations per sample or `limit_s` of work.
-        Raises ValueError for a window outside the trajectory or a missing variable.
+
+        Parameters
+        ----------
+        trajectory : run
+            A Trajectory, a table or arrays (t, x), as `discover` takes them.
+        start : int, default 0
+            Number of the sample to start from.
+        n_samples : int, optional
+            Number of samples to integrate. None takes all that follow.
+        initial : (n_states,) array, optional
+            State at that sample, in SI. None takes the data's.
+        blow_up : float, default 100.0
+            A state that exceeds this many times its largest value in the window ends the run as
+            diverged.
+        rtol : float, default 1e-08
+            Relative tolerance of the solver.
+        limit_s : float, default 300.0
+            Work in s after which the run ends.
+
+        Returns
+        -------
+        Rollout
+            The states at the times of the trajectory.
+
+        Raises
+        ------
+        ValueError
+            If the window lies outside the trajectory, or a variable is missing.
         """
         run = trajectory_of(trajectory)
         window = run.window(start, run.n_samples if n_samples is None else start + n_samples)
@@ -204,18 +259,43 @@ class SparseModel:
     ) -> Rollout:
         """Integrate freely from the state x0 at t[0]; returns the states at the times t.
 
-        t: (samples,) in s, increasing. x0: (n_states,), in SI, or a mapping by name. inputs:
-        (samples, n_inputs) at t, between which they follow the model's `courses`; or a mapping from
-        name to samples, a number, or a function of t in s.
-        Returns a `Rollout`, whose `trajectory()` is the run as data. A run that diverges also
-        returns one, marked `diverged` and with a message. It ends when a state exceeds `blow_up`
-        times its scale, or when the solver gives up (see `rollout`). The scale of a state is its
-        initial value; if that is zero, what the model's fastest time scale makes of it.
-        draws: number of further runs, from the same start, with coefficients drawn from their
-        covariance; `Rollout.band` gives their bounds. For the uncertainty of start, noise and model
-        as well, see `ep.forecast`.
-        Raises ValueError for a missing or unknown input, for wrong shapes, and for draws from a
-        model without covariance.
+        A run that diverges also returns a result, marked `diverged` and with a message. It ends
+        when a state exceeds `blow_up` times its scale, or when the solver gives up (see `rollout`).
+        The scale of a state is its initial value; if that is zero, what the model's fastest time
+        scale makes of it.
+
+        Parameters
+        ----------
+        t : array_like (samples,)
+            Times in s, increasing.
+        x0 : array_like (n_states,) or mapping of str to float
+            State at t[0], in SI, in order or by name.
+        inputs : array_like (samples, n_inputs) or mapping, optional
+            Inputs at t, between which they follow the model's `courses`; or, by name, samples, a
+            number, or a function of t in s.
+        blow_up : float, default 1000000000000.0
+            Factor at which a run counts as diverged.
+        rtol : float, default 1e-08
+            Relative tolerance of the solver.
+        limit_s : float, default 300.0
+            Work in s after which the run ends.
+        draws : int, default 0
+            Number of further runs, from the same start, with coefficients drawn from their
+            covariance; `Rollout.band` gives their bounds. For the uncertainty of start, noise and
+            model as well, see `ep.forecast`.
+        seed : int, default 0
+            Of the random draws.
+
+        Returns
+        -------
+        Rollout
+            The run. Its `trajectory()` returns it as data.
+
+        Raises
+        ------
+        ValueError
+            If an input is missing or unknown, shapes are wrong, or draws are asked of a model
+            without covariance.
         """
         run = simulate(self, t, x0, inputs, blow_up=blow_up, rtol=rtol, limit_s=limit_s)
         run = replace(run, clock=self.clock)
@@ -238,10 +318,23 @@ class SparseModel:
     ) -> Float[np.ndarray, "... n_states"]:
         """Right-hand side at many samples at once, in SI per second.
 
-        x: (samples, n_states), or one sample (n_states,), or a Trajectory (or a table with a time
-        column), which contains its own inputs. inputs: the same number of samples, in the order
-        of `inputs`, or by name.
-        Raises ValueError for a missing or unknown variable and for wrong shapes.
+        Parameters
+        ----------
+        x : array_like (samples, n_states) or run
+            States, or one sample (n_states,), or a Trajectory (or a table with a time column),
+            which contains its own inputs.
+        inputs : array_like or mapping, optional
+            The same number of samples, in the order of `inputs`, or by name.
+
+        Returns
+        -------
+        (..., n_states) array
+            The derivative.
+
+        Raises
+        ------
+        ValueError
+            If a variable is missing or unknown, or shapes are wrong.
         """
         if is_run(x):
             run = trajectory_of(x)
@@ -266,13 +359,27 @@ class SparseModel:
     ) -> float:
         """R2 of the derivative over a trajectory, averaged over the states; one is perfect.
 
-        run: as `discover` takes it.
-        x_dot: (samples, n_states), the true derivative in SI, in the order of the model's states;
-        the right-hand side is then evaluated at the raw samples. With None, the derivative and
-        the samples for the right-hand side come from `smoother`, by default SavitzkyGolay(), as
-        in `Differential`.
-        Raises ValueError for a missing variable, a wrong shape, a derivative that is constant, or
-        a sample outside the domain of a function of the model.
+        Parameters
+        ----------
+        run : run
+            A run as `discover` takes it.
+        x_dot : (samples, n_states) array, optional
+            The true derivative in SI, in the order of the model's states; the right-hand side is
+            then evaluated at the raw samples. None takes the derivative and the samples from
+            `smoother`.
+        smoother : Smoother, optional
+            By default SavitzkyGolay(), as in `Differential`.
+
+        Returns
+        -------
+        float
+            The mean R2.
+
+        Raises
+        ------
+        ValueError
+            If a variable is missing, a shape is wrong, a derivative is constant, or a sample lies
+            outside the domain of a function of the model.
         """
         run, library = trajectory_of(run), self.field.library
         check_domain([run], library, smooth=x_dot is None)
@@ -368,7 +475,25 @@ def _smooth_samples(
 def coef_matrix(
     library: Library, equations: Sequence[Mapping[str, float]]
 ) -> Float[np.ndarray, "terms equations"]:
-    """Matrix of coefficients over the library, from coefficients by term name."""
+    """Matrix of coefficients over the library, from coefficients by term name.
+
+    Parameters
+    ----------
+    library : Library
+        The terms.
+    equations : sequence of mapping of str to float
+        Coefficients in SI of each equation, by term name.
+
+    Returns
+    -------
+    (terms, equations) array
+        The matrix, zero for other terms.
+
+    Raises
+    ------
+    ValueError
+        If the library lacks a term.
+    """
     coef = np.zeros((len(library), len(equations)))
     for k, terms in enumerate(equations):
         coef[[library.index(name) for name in terms], k] = list(terms.values())

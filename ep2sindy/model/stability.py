@@ -98,15 +98,41 @@ def limit_cycle(
 ) -> LimitCycle | None:
     """Closed orbit near a state, by Newton's method on the return after one period.
 
-    start: near the cycle, in SI. period_s: a guess, within 30 %.
-    Unknowns are the state, which moves across the flow, and the period. Steps are of least norm:
-    if closed orbits form a family (predator and prey), a neighbouring one is found.
     If no orbit is found, the search begins again ten periods later, nearer to an attracting cycle,
     and finally backwards in time, where a repelling cycle attracts.
-    Returns None if the states diverge, Newton's method finds no closed orbit with a period of half
-    to twice the guess, or it ends on a fixed point. If the guess is several periods, the orbit
-    with the least period is returned.
-    Raises ValueError for a model with inputs, or a wrong start, period or number of samples.
+
+    Parameters
+    ----------
+    model : SparseModel
+        A model without inputs.
+    start : (n_states,) array
+        State near the cycle, in SI.
+    period_s : float
+        A guess of the period in s, within 30 %.
+    n_samples : int, default 128
+        Number of samples of the orbit.
+
+    Returns
+    -------
+    LimitCycle or None
+        The orbit with its Floquet multipliers. None if the states diverge, Newton's method finds no
+        closed orbit with a period of half to twice the guess, or it ends on a fixed point. If the
+        guess is several periods, the orbit with the least period is returned.
+
+    Raises
+    ------
+    ValueError
+        If the model has inputs, or the start, the period or the number of samples is wrong.
+
+    Notes
+    -----
+    Solves, for the state x and the period T,
+
+        flow(x, T) - x = 0
+
+    where x moves across the flow. Steps are of least norm: if closed orbits form a family (predator
+    and prey), a neighbouring one is found.
+
     Source: Seydel 2010, Practical Bifurcation and Stability Analysis, chapter 7.
     """
     _check_free(model)
@@ -149,17 +175,41 @@ def basin_stability(
 ) -> float:
     """Fraction of starts that end on a cycle: within 0.1 of it over their last three periods.
 
-    n_periods: that are waited for; None takes `periods_to_reach`.
+    Distances are to the cycle's curve, with states in units of their standard deviation on it. In
+    the last periods a run must also pass through all quarters of the cycle.
 
-    Distances are to the cycle's curve, with states in units of their standard deviation on it.
-    In the last periods a run must also pass through all quarters of the cycle.
-    Starts fill a box (Halton points, so nothing is random). A state that keeps one sign on the
-    cycle takes values from spread[0] to spread[1] times its mean, evenly in the logarithm. Any
-    other state takes values within spread[1] times half its range of its mean, evenly.
-    Every start has its own time step: a 64th of the period, or one over the norm of the Jacobian
-    if that is less. A run is given up when it is 30 times as far from the cycle's mean as the
-    farthest start, or after four times the steps that the cycle takes.
-    Raises ValueError for a model with inputs, a cycle of another model or a wrong setting.
+    Parameters
+    ----------
+    model : SparseModel
+        A model without inputs.
+    cycle : LimitCycle
+        Its cycle, from `limit_cycle`.
+    n_starts : int, default 64
+        Number of starts.
+    n_periods : float, optional
+        Number of periods after which a run is assessed. None takes `periods_to_reach`.
+    spread : (float, float), default (0.3, 3.0)
+        Starts fill a box (Halton points, so nothing is random). A state that keeps one sign on the
+        cycle takes values from spread[0] to spread[1] times its mean, evenly in the logarithm. Any
+        other state takes values within spread[1] times half its range of its mean, evenly.
+
+    Returns
+    -------
+    float
+        The fraction, 0 to 1.
+
+    Raises
+    ------
+    ValueError
+        If the model has inputs, the cycle is of another model, or a setting is wrong.
+
+    Notes
+    -----
+    Every start has its own time step: a 64th of the period, or one over the norm of the Jacobian if
+    that is less. A run is given up when it is 30 times as far from the cycle's mean as the farthest
+    start, or after four times the steps that the cycle takes.
+
+    Source: Menck, Heitzig, Marwan & Kurths 2013, doi:10.1038/nphys2516, for the measure.
     """
     n_periods = periods_to_reach(cycle) if n_periods is None else n_periods
     _check_reach(model, cycle, n_starts=n_starts, n_periods=n_periods, spread=spread)

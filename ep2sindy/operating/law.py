@@ -39,19 +39,53 @@ INSIDE = 1e-6  # tolerance of the hull, in ranges of the parameters
 
 @dataclass(frozen=True, eq=False)
 class OperatingLaw:
-    """One structure whose coefficients are functions of the operating point p: c(p) = W f(p).
+    """One set of equations whose coefficients are functions of the operating point.
 
-    `ep.discover(runs, law=1).law` is one; `PointFits.law` says how it is fitted. Under relations
-    c(p) = C W f(p) + D g(p), with C and D of a `LawConstraint`; `coef` holds the whole, by the
-    functions f and g.
-    Assumes that the same terms act at every point, and coefficients smooth enough for f.
-    functions: of the parameters. library: of the states. coefficients: (state, term) of each row of
-    coef, in SI. covariance: of coef.ravel(), None if unknown. points: the operating points of the
-    fit, columns in the order of the functions' variables. left_out: for each point, the error of
-    the rates that the law of the other points gives it, as a fraction of its rates; None if the
-    points do not suffice for a law without each of them. Source: Rudy et al. 2019,
-    doi:10.1137/18M1191944, for coefficients that depend on a parameter.
+    `ep.discover(runs, law=1).law` is one; `PointFits.law` fits it.
 
+    Parameters
+    ----------
+    functions : Library
+        Functions of the parameters.
+    library : Library
+        Terms over the states.
+    states : tuple of str
+        Names of the states.
+    coefficients : tuple of (str, str)
+        (state, term) of each row of coef.
+    coef : (coefs, functions) array
+        Factor of each function in each coefficient, in SI.
+    points : (points, parameters) array
+        The operating points of the fit, with columns in the order of the functions' variables.
+    covariance : (n, n) array, optional
+        Covariance of coef.ravel(). None if it is unknown.
+    units : mapping of str to str, default {}
+        Units of the states.
+    provenance : mapping of str to str, default {}
+        Record of how the law was found.
+    left_out : (points,) array, optional
+        For each point, the error of the rates that the law of the other points predicts for it, as
+        a fraction of its rates. None if the points do not suffice for a law without each of them.
+
+    Raises
+    ------
+    ValueError
+        If shapes do not fit, numbers are not finite, or a coefficient is of an unknown state or
+        term.
+
+    Notes
+    -----
+    At the operating point p, the coefficients are
+
+        c(p) = W f(p),   under relations c(p) = C W f(p) + D g(p)
+
+    with C and D of a `LawConstraint`; `coef` holds the whole, by the functions f and g. Assumes
+    that the same terms act at every point, and coefficients smooth enough for f.
+
+    Source: Rudy et al. 2019, doi:10.1137/18M1191944, for coefficients that depend on a parameter.
+
+    Examples
+    --------
     >>> functions, library = ep.polynomial(["a"], degree=1), ep.polynomial(["x"], degree=1)
     >>> pairs, points = (("x", "x"),), np.array([[0.0], [2.0]])
     >>> coef = np.array([[0.0, -1.0]])  # x' = -a x
@@ -125,10 +159,24 @@ class OperatingLaw:
     def at(self, *, extrapolate: bool = False, **parameters: float) -> SparseModel:
         """The model at an operating point, which need not be one of the fitted points.
 
-        parameters: a value for each parameter of the law, as in `at(V_D_V=330, mdot_mg_s=4.6)`.
-        Raises ValueError for other parameters, or values that are not finite. Also raises
-        ValueError outside the convex hull of the fitted points, unless extrapolate=True; the
-        model's provenance then says that it is extrapolated.
+        Parameters
+        ----------
+        extrapolate : bool, default False
+            True allows points outside the convex hull of the fitted points; the model's provenance
+            then records that it is extrapolated.
+        **parameters : float
+            A value for each parameter of the law, as in `at(V_D_V=330, mdot_mg_s=4.6)`.
+
+        Returns
+        -------
+        SparseModel
+            The equations at that point.
+
+        Raises
+        ------
+        ValueError
+            If parameters are missing or unknown, values are not finite, or the point lies outside
+            the convex hull of the fitted points without `extrapolate`.
         """
         (values,) = read_points([parameters], self.parameters)
         label, inside = point_label(parameters), in_hull(self.points, values)

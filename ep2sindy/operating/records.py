@@ -181,6 +181,18 @@ def most_central(points: Float[np.ndarray, "points parameters"]) -> int:
 def branches_of(records: Sequence[OperatingRecord]) -> Int[np.ndarray, " records"]:
     """Cycle of each record: 0 on the stronger (or only) cycle, 1 on the weaker.
 
+    Parameters
+    ----------
+    records : sequence of OperatingRecord
+        Records of several operating points.
+
+    Returns
+    -------
+    (records,) int array
+        The number of the cycle of each record.
+
+    Notes
+    -----
     The logarithm of the standard deviation, in the mean over the states, is fitted robustly by a
     plane over the parameters, and its residuals are sorted. Two cycles coexist if the residuals
     show a gap that is wide compared with the spread on either side of it.

@@ -105,17 +105,52 @@ def refine_with_correction(
 ) -> Corrected:
     """Train x' = model + correction(states, inputs) to follow windows of the trajectories.
 
-    correction: maps (rows, states + inputs) to (rows, states). Each state is in units of its
-    standard deviation, each input of its rms; the derivative is in units of the known part's rms
-    over the data. It is best zero initially (last layer of zeros), so that training starts from
-    the known part. It is copied. Its initial weights come from the caller and are the only
-    randomness besides the windows: seed them by torch.manual_seed.
-    changes: any of the `settings`, as in `refine`; no reweighting if left out. Begin with a short
-    `window`, since a model that lacks a term can hardly follow long ones.
-    method: None means GradientDescent(max_iter=60, tolerance=1e-3, patience=5). constraint:
-    relations, or known coefficients that are kept fixed. Other arguments are as in `refine`.
-    Raises ValueError as `refine`, for a correction of the wrong shape, and for another method. A
+    Begin with a short `window`, since a model that lacks a term can hardly follow long ones. A
     failed fit is a result: see `status`.
+
+    Parameters
+    ----------
+    model : SparseModel
+        The known part of the equations.
+    trajectories : sequence of Trajectory
+        The records.
+    correction : Module
+        Torch module that maps (rows, states + inputs) to (rows, states). Each state is in units of
+        its standard deviation, each input of its rms; the derivative is in units of the known
+        part's rms over the data. It is best zero initially (last layer of zeros), so that training
+        starts from the known part. It is copied. Its initial weights come from you and are the only
+        randomness besides the windows: seed them by torch.manual_seed.
+    settings : RefinementSettings, default SETTINGS
+        Windows and method. Without reweighting, and with GradientDescent(max_iter=60,
+        tolerance=1e-3, patience=5), if left out.
+    seed : int or Generator, default 0
+        Of the random windows.
+    callback : callable, optional
+        Called after every iteration, with its `Iteration`.
+    device : str, default 'cpu'
+        Device of torch, such as "cpu" or "cuda".
+    progress : Progress or bool, default False
+        True shows bars.
+    **changes : fields of RefinementSettings
+        Any of the `settings`, which they replace, as in `refine`.
+
+    Returns
+    -------
+    Corrected
+        The model with its trained correction, the loss and the status.
+
+    Raises
+    ------
+    ValueError
+        As `refine`, for a correction of the wrong shape, and for another method.
+
+    Notes
+    -----
+    Over the free coefficients c, the weights p of the correction g and the starts of the windows,
+
+        minimise sum over windows w, samples k: |(x_w(t_k; c, p) - data_w,k) / std|^2
+        with x' = Theta(x, u) c + g(x, u; p)
+
     Source: Rackauckas et al. 2020, arXiv:2001.04385.
     """
     settings = settings.override(changes)

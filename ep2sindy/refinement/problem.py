@@ -44,19 +44,34 @@ class RefinementChanges(TypedDict, total=False):
 class RefinementSettings:
     """Settings of a refinement: the windows to be followed, and the method.
 
-    n_windows: number of windows, spread over the trajectories; fewer if the data are too short.
-    window: samples in each window; None takes `periods`.
-    periods: periods of the dominant frequency in each window, as far as the data allow; None takes
-    one and a half, unless `window` is given.
-    method: None means MultipleShooting(), unless a function states its own default.
-    constraint: relations between coefficients, or known coefficients that are kept fixed; None
-    leaves every coefficient free.
-    free_start: also fit the initial state of each window, whose noise would otherwise bias the
-    coefficients; False starts at the data, as in the thesis.
-    n_reweights: number of passes with each state weighted by 1/std of its residuals.
-    Raises ValueError for less than one window or one with too few samples, for windows set by
-    both samples and periods, or for a negative number of passes.
+    Parameters
+    ----------
+    n_windows : int, default 30
+        Number of windows, spread over the trajectories; fewer if the data are too short.
+    window : int, optional
+        Number of samples in each window. None takes `periods`.
+    periods : float, optional
+        Periods of the dominant frequency in each window, as far as the data allow. None takes one
+        and a half, unless `window` is given.
+    method : MultipleShooting or GradientDescent, optional
+        None means MultipleShooting(), unless a function states its own default.
+    constraint : Constraint, optional
+        Relations between coefficients, or known coefficients that stay fixed. None leaves every
+        coefficient free.
+    free_start : bool, default True
+        True also fits the initial state of each window, whose noise would otherwise bias the
+        coefficients. False starts at the data, as in the thesis.
+    n_reweights : int, default 1
+        Number of passes with each state weighted by 1/std of its residuals.
 
+    Raises
+    ------
+    ValueError
+        If there is no window, a window has too few samples, windows are set by both samples and
+        periods, or the number of passes is negative.
+
+    Examples
+    --------
     >>> ep.refinement.RefinementSettings(n_windows=20, periods=2.0).free_start
     True
     """

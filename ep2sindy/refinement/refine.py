@@ -132,18 +132,64 @@ def refine(
 ) -> Refinement | list[Refinement]:
     """Fit the free coefficients to windows spread over trajectories, by least squares.
 
-    model: one model, or a list of models of the same states. trajectories: one run or a list, as
-    `discover` takes them; for a list of models a list each, and the result is a list. changes: any
-    of the `settings`, such as window=50, which they replace. constraints: for a list, the
-    constraint of each model or None, in place of `constraint`. points_per_batch: models integrated
-    together, few enough for the processor's cache; thousands on a GPU. progress: see `Progress`.
-    Raises ValueError for a window that fits no trajectory, a missing variable, a model without
-    terms, a constraint that leaves out one, or models that differ in their variables or the number
-    of their windows. A failed fit is a result: see `status` and `message`.
-    >>> run = ep.lotka_volterra().trajectory(noise=0.02, rng=0)
-    >>> refined = ep.refine(ep.discover(run).model, run)
-    >>> str(refined.status)
-    'converged'
+    The terms of the model stay; their coefficients change until the integrated model follows
+    windows of the data. A failed fit is a result: see `status` and `message`.
+
+    Parameters
+    ----------
+    model : SparseModel or list of SparseModel
+        One model, or a list of models of the same states.
+    trajectories : run, or list or dict of runs
+        As `discover` takes them. For a list of models a list each.
+    settings : RefinementSettings, default SETTINGS
+        Windows and method.
+    constraints : sequence of Constraint or None, optional
+        For a list of models, the constraint of each, in place of `settings.constraint`.
+    points_per_batch : int, default 8
+        Number of models integrated together: few enough for the processor's cache, or thousands on
+        a GPU.
+    seed : int or Generator, default 0
+        Of the random windows.
+    callback : callable, optional
+        Called after every iteration, with its `Iteration`.
+    device : str, default 'cpu'
+        Device of torch, such as "cpu" or "cuda".
+    progress : Progress or bool, default False
+        True shows bars.
+    **changes : fields of RefinementSettings
+        Any of the `settings`, such as window=50, which they replace.
+
+    Returns
+    -------
+    Refinement or list of Refinement
+        The refined model with the covariance of its coefficients, the loss, the status and the
+        history.
+
+    Raises
+    ------
+    ValueError
+        If a window fits no trajectory, a variable is missing, a model has no terms or not those of
+        its constraint, or models differ in their variables or the number of their windows.
+
+    Notes
+    -----
+    Minimises over the free coefficients c and the initial states of the windows
+
+        sum over windows w, samples k: |(x_w(t_k; c) - data_w,k) / std|^2
+
+    where x_w is the integrated model. Each state is weighted by 1/std of its residuals in the last
+    passes (`n_reweights`). Assumes residuals of constant variance in each state.
+
+    Source: Bock 1983, doi:10.1007/978-1-4684-7324-7_7, for multiple shooting; the thesis, integral
+    least squares.
+
+    Examples
+    --------
+    >>> system = ep.lotka_volterra()
+    >>> start = ep.lotka_volterra(a=0.6).model
+    >>> refined = ep.refine(start, system.trajectory(noise=0.02, rng=0))
+    >>> str(refined.status), round(refined.model.terms("x")["x"], 2)
+    ('converged', 0.67)
     """
     settings = settings.override(changes)
     models, records = _by_model(model, trajectories)

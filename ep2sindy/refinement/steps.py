@@ -42,9 +42,19 @@ class Step(Protocol):
 
 @dataclass(frozen=True)
 class RungeKutta:
-    """torchdiffeq's `rk4` (3/8 rule) on the module itself, `n_substeps` equal steps per sample.
+    """Steps of torchdiffeq's `rk4` (3/8 rule) on the torch module itself.
 
     All steps of all windows are integrated in one call, the states together with their tangents.
+
+    Parameters
+    ----------
+    n_substeps : int, default 1
+        Number of equal steps per sample.
+
+    Raises
+    ------
+    ValueError
+        If there is no step.
     """
 
     n_substeps: int = 1
@@ -94,7 +104,17 @@ def integrate(
 class FusedRungeKutta:
     """The steps of `RungeKutta` in a compiled kernel, for searches that refine many models.
 
-    It takes equations of products on the CPU alone; `fastest_step` asks for it where it can.
+    It takes equations of products, on the CPU only; `fastest_step` selects it where it can.
+
+    Parameters
+    ----------
+    n_substeps : int, default 1
+        Number of equal steps per sample.
+
+    Raises
+    ------
+    ValueError
+        If there is no step.
     """
 
     n_substeps: int = 1

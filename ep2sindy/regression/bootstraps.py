@@ -26,18 +26,44 @@ MOST_WEIGHTS = 2**24  # weights of rows, over the draws that are made at once
 class Bootstraps:
     """Repeated draws of rows and of a reduced library, so that no support depends on a few rows.
 
-        X^T W_k X and X^T W_k y of draw k, W_k the diagonal of how often each row was drawn
+    Each draw takes, with replacement, a random fraction of the training groups, and leaves out some
+    random terms. The search runs once per draw.
 
-    A search sees one pair per draw. Assumes that the groups of rows are exchangeable; with block
-    above 1, that rows farther apart than a block are uncorrelated.
-    Each of the `n` draws takes, with replacement, a random fraction of the training groups
-    between `smallest` and `largest`, and leaves out `n_culled` random terms.
-    block: number of neighbouring training groups drawn together. 1 draws single groups, as in the
-    thesis, and understates the scatter for a time series, whose neighbours are correlated. More
-    than 1 is allowed for one trajectory only. A draw of fewer rows than there are scatters more
-    than the whole record would. n = 0: one search on all training rows and terms.
+    Parameters
+    ----------
+    n : int, default 32
+        Number of draws. 0 means one search on all training rows and terms.
+    n_culled : int, default 1
+        Number of random terms left out of each draw.
+    smallest : float, default 0.2
+        Smallest fraction of the training groups in a draw.
+    largest : float, default 0.8
+        Largest fraction. A draw of fewer rows than there are scatters more than the whole record
+        would.
+    block : int, default 1
+        Number of neighbouring training groups drawn together. 1 draws single groups, as in the
+        thesis, and understates the scatter for a time series, whose neighbours are correlated. More
+        than 1 is allowed for one trajectory only.
+
+    Raises
+    ------
+    ValueError
+        If a number is negative, block is below one, or not 0 < smallest <= largest.
+
+    Notes
+    -----
+    The search sees the pair of products
+
+        X^T W_k X,   X^T W_k y
+
+    of draw k, with W_k the diagonal of how often each row was drawn. Assumes that the groups of
+    rows are exchangeable; with block above 1, that rows farther apart than a block are
+    uncorrelated.
+
     Source: the thesis, II-C and II-H; Kuensch 1989, doi:10.1214/aos/1176347265, for blocks.
 
+    Examples
+    --------
     >>> thesis = ep.Regression(ep.Differential(), ep.AdaptiveLasso(), ep.Knee(), ep.Bootstraps(50))
     >>> run = ep.lotka_volterra().trajectory(noise=0.01, rng=0)
     >>> ep.discover(run, method=thesis, seed=0).chosen["x"].fraction  # of draws with these terms

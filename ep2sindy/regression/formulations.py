@@ -36,7 +36,18 @@ class Split(Protocol):
 
 @dataclass(frozen=True)
 class RandomSplit:
-    """Hold out a random fraction of the groups of each trajectory, as in the thesis."""
+    """Hold out a random fraction of the groups of each trajectory, as in the thesis.
+
+    Parameters
+    ----------
+    test_fraction : float, default 0.25
+        Fraction that is held out.
+
+    Raises
+    ------
+    ValueError
+        If the fraction is out of range.
+    """
 
     test_fraction: float = 0.25
 
@@ -53,6 +64,18 @@ class BlockSplit:
 
     Neighbours in a time series are correlated, so randomly held-out rows would resemble training
     rows.
+
+    Parameters
+    ----------
+    test_fraction : float, default 0.25
+        Fraction that is held out.
+    n_blocks : int, default 20
+        Number of blocks into which a trajectory is cut.
+
+    Raises
+    ------
+    ValueError
+        If the fraction is out of range, or there is no block.
     """
 
     test_fraction: float = 0.25
@@ -77,8 +100,41 @@ def _check_fraction(fraction: float) -> None:
 class Differential:
     """Regress the derivative at every sample on the library at that sample.
 
-    smooth_library: evaluate the terms on smoothed samples (default) or on raw ones (the thesis).
-    With noise in the terms a wrong support can score best.
+    It is the simplest formulation, for samples with little noise. The derivative comes from the
+    smoother.
+
+    Parameters
+    ----------
+    smoother : Smoother, default SavitzkyGolay()
+        What smooths the samples and differentiates them.
+    smooth_library : bool, default True
+        True evaluates the terms on smoothed samples, False on raw ones, as in the thesis. With
+        noise in the terms a wrong support can score best.
+    split : Split, default RandomSplit()
+        Which samples are held out to test the candidates.
+
+    Raises
+    ------
+    ValueError
+        If the smoother or the split is none.
+
+    Notes
+    -----
+    The row of sample k in the regression of one state is
+
+        x'(t_k) = sum_j c_j theta_j(x(t_k), u(t_k))
+
+    and the search minimises |x' - Theta c|^2 over all training rows. Assumes that the error of the
+    derivative is independent from row to row, which smoothing violates.
+
+    Source: Brunton, Proctor & Kutz 2016, doi:10.1073/pnas.1517384113; the thesis, II.
+
+    Examples
+    --------
+    >>> run = ep.lotka_volterra().trajectory()
+    >>> method = ep.Regression(ep.Differential(), ep.AdaptiveLasso(), ep.Knee())
+    >>> list(ep.discover(run, method=method).model.terms("x"))
+    ['x', 'x*y']
     """
 
     smoother: Smoother = field(default_factory=SavitzkyGolay)
@@ -150,17 +206,51 @@ MAX_SEGMENTS = 20  # segments of a trajectory at most; each is held out or resam
 class Weak:
     """Regress mean derivatives over windows on mean library terms over the same windows.
 
-    test_functions: `Bumps`, with a separate width for every state, or `Boxes`, as in the thesis.
-    smooth_library: evaluate the terms on smoothed samples (the default) or on raw ones. The
-    left-hand side always comes from the raw samples.
-    split: holds out segments of time, each at least two windows long if there is room. A window
-    that reaches into both kinds of segments is dropped, so that no training row shares a sample
-    with a held-out one.
-    errors_in_variables: propagate the noise of the samples to the rows, so that criteria and the
-    final fit can weight them by their covariance (see `regression.whitening`). For Bumps only:
-    Boxes may outnumber the samples, and then depend on each other.
-    exact_inputs: inputs without noise, which are neither smoothed nor corrected. None takes inputs
-    that are switched, held or constant, or whose noise is below 0.1 % of their standard deviation.
+    No sample is differentiated: the derivative moves to known test functions by integration by
+    parts. The left-hand side always comes from the raw samples.
+
+    Parameters
+    ----------
+    test_functions : WindowFunctions, default Bumps()
+        `Bumps`, with a separate width for every state, or `Boxes`, as in the thesis.
+    smoother : Smoother, default KalmanSmoother()
+        What smooths the samples on which the terms are evaluated.
+    smooth_library : bool, default True
+        True evaluates the terms on smoothed samples, False on raw ones.
+    split : Split, default RandomSplit()
+        Which segments of time are held out, each at least two windows long if there is room. A
+        window that reaches into both kinds of segments is dropped, so that no training row shares a
+        sample with a held-out one.
+    errors_in_variables : bool, default True
+        True propagates the noise of the samples to the rows, so that criteria and the final fit can
+        weight them by their covariance (`regression.whitening`). For `Bumps` only: `Boxes` may
+        outnumber the samples, and then depend on each other.
+    exact_inputs : sequence of str, optional
+        Inputs without noise, which are neither smoothed nor corrected. None takes inputs that are
+        switched, held or constant, or whose noise is below 0.1 % of their standard deviation.
+
+    Raises
+    ------
+    ValueError
+        If a setting is of the wrong kind, or errors_in_variables is set with `Boxes`.
+
+    Notes
+    -----
+    The row of window k, with its test function phi_k, is
+
+        -integral phi_k' x dt = sum_j c_j integral phi_k theta_j(x, u) dt
+
+    divided by the integral of phi_k, and the search minimises the squared difference of both sides
+    over all training rows.
+
+    Source: Messenger & Bortz 2021, doi:10.1137/20M1343166; the thesis, Eqs. 10 and 11, for boxes.
+
+    Examples
+    --------
+    >>> run = ep.lotka_volterra().trajectory(noise=0.02, rng=0)
+    >>> found = ep.discover(run, method=ep.Regression(ep.Weak()))
+    >>> found.model.terms("x")
+    {'x': 0.66..., 'x*y': -0.99...}
     """
 
     test_functions: WindowFunctions = field(default_factory=Bumps)
@@ -310,19 +400,38 @@ class _Sampled:
 
 @dataclass(frozen=True)
 class WeightedWeak:
-    """Weak rows that are whitened under the whole library: the best rows for a search in noise.
+    """Weak rows weighted by the covariance of their noise under the whole library.
 
-        r = L^-1 (y - X b), L L^T = C the covariance of y - X b by the noise of the samples
+    They are the best rows for a search in noise. They are linearised about samples corrected with
+    all terms, so that no support is favoured. The residual of a support then measures its
+    likelihood, and the true support is the best of its size far more often (docs/benchmark.md).
 
-    Here y and X are the rows of `weak`, and b the coefficients of all terms. They are weighted by
-    their covariance, and linearised about samples corrected in `n_steps` steps with all terms, so
-    that no support is favoured. The residual of a support then measures its likelihood, and the
-    true support is the best of its size far more often (docs/benchmark.md). The noise of the
-    samples is assumed white, and the law in the library: fast dynamics that no term describes would
-    be taken for noise. Rows are in the unit of the derivative, up to a factor.
-    Raises ValueError for held-out rows, which the weights do not include.
+    Parameters
+    ----------
+    weak : Weak, default Weak(split=RandomSplit(0.0))
+        The weak rows, without held-out segments and with errors_in_variables.
+    n_steps : int, default 2
+        Number of steps in which the samples are corrected.
+
+    Raises
+    ------
+    ValueError
+        If rows are held out, which the weights do not include, or the noise is not propagated.
+
+    Notes
+    -----
+    With the rows y and X of `weak` and the coefficients b of all terms,
+
+        minimise |L^-1 (y - X b)|^2,   L L^T = C = covariance of y - X b by the noise of the samples
+
+    Assumes that the noise of the samples is white, and the law in the library: fast dynamics that
+    no term describes would be taken for noise. Rows are in the unit of the derivative, up to a
+    factor.
+
     Source: Bortz, Messenger & Dukic 2023, doi:10.1007/s11538-023-01208-6, for the covariance.
 
+    Examples
+    --------
     >>> from ep2sindy.regression.front import fit_support
     >>> run = ep.lotka_volterra().trajectory(noise=0.01, rng=0)
     >>> library, rng = ep.polynomial(["x", "y"], degree=2), np.random.default_rng(0)

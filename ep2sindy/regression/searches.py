@@ -46,15 +46,34 @@ class Search(Protocol):
 class AdaptiveLasso:
     """All supports on the exact path of the adaptive lasso.
 
-        minimise |y - X b|^2 + penalty * sum_j |b_j| / |b_ols_j|^gamma, as the penalty falls to zero
+    The path needs only the Gram matrix, and does not depend on the units of the columns.
 
-    Assumes that least squares b_ols of all terms are consistent: large where a term is true, small
-    where it is not. Noise in the terms and columns nearly dependent break this. The path is
-    piecewise linear and needs only the Gram matrix; it does not depend on the units of the columns.
-    max_terms: number of terms at which the path stops; None for all terms.
-    Source: Zou 2006, doi:10.1198/016214506000000735; the thesis, Eq. 8; for the path see
-    `search_kernels.lasso_path`.
+    Parameters
+    ----------
+    gamma : float, default 1.0
+        Exponent of the weights, positive.
+    max_terms : int, optional
+        Number of terms at which the path stops. None continues to all terms.
 
+    Raises
+    ------
+    ValueError
+        If gamma is not positive, or max_terms is below one.
+
+    Notes
+    -----
+    As the penalty lambda falls to zero,
+
+        minimise |y - X b|^2 + lambda sum_j |b_j| / |b_ols,j|^gamma over b
+
+    Assumes that the least squares b_ols of all terms are consistent: large where a term is true,
+    small where it is not. Noise in the terms and nearly dependent columns violate this. The path is
+    piecewise linear in lambda (`search_kernels.lasso_path`).
+
+    Source: Zou 2006, doi:10.1198/016214506000000735; the thesis, Eq. 8.
+
+    Examples
+    --------
     >>> xx, xy = np.array([[1.0, 0.6], [0.6, 1.0]]), np.array([0.9, 0.3])
     >>> ep.AdaptiveLasso().supports(xx, xy, 1.0).tolist()
     [[False, False], [True, False], [True, True]]
@@ -80,16 +99,43 @@ class AdaptiveLasso:
 class STLSQ:
     """Sequentially thresholded least squares, over a sweep of thresholds.
 
-        S <- {j in S: |b_j| > threshold}, b = least squares of y on X_S, until S stays
+    At each threshold, terms with a smaller coefficient are dropped and the others are fitted again,
+    until no term is dropped. If neighbouring thresholds end at one support, it is returned once.
 
-    Its fixed points are local minima of |y - X b|^2 + threshold^2 |S|. Assumes that the terms are
-    nearly orthogonal, so that a false one has a small coefficient from the first fit on: what is
-    once dropped does not come back.
-    Thresholds are fractions of the norm of the target, for columns of unit norm, spaced evenly in
-    the logarithm. Where neighbours end at one support, it is given once.
+    Parameters
+    ----------
+    lowest : float, default 0.0001
+        Lowest threshold, as a fraction of the norm of the target, for columns of unit norm.
+    highest : float, default 10.0
+        Highest threshold, in the same unit.
+    n_thresholds : int, default 100
+        Number of thresholds, spaced evenly in the logarithm.
+    max_terms : int, optional
+        Larger supports are left out. None leaves out none.
+
+    Raises
+    ------
+    ValueError
+        If not 0 < lowest < highest, there are fewer than two thresholds, or max_terms is below one.
+
+    Notes
+    -----
+    The iteration is
+
+        S <- {j in S: |b_j| > threshold},   b = least squares of y on X_S
+
+    and its fixed points are local minima of
+
+        |y - X b|^2 + threshold^2 |S|
+
+    Assumes that the terms are nearly orthogonal, so that a false one has a small coefficient from
+    the first fit on: a term that was dropped never returns.
+
     Source: Brunton, Proctor & Kutz 2016, doi:10.1073/pnas.1517384113; Zhang & Schaeffer 2019,
     doi:10.1137/18M1189828, for the objective.
 
+    Examples
+    --------
     >>> xx, xy = np.array([[1.0, 0.6], [0.6, 1.0]]), np.array([0.9, 0.3])
     >>> ep.STLSQ(lowest=0.1, highest=0.5, n_thresholds=3).supports(xx, xy, 1.0).tolist()
     [[True, True], [True, False]]
@@ -129,16 +175,37 @@ class Unproven(UserWarning):
 class BestSubset:
     """The supports of least residual of every size, proven best by branch and bound.
 
-        minimise |y - X_S b|^2 over b and over all supports S of k terms, for k = 0 ... max_terms
+    If a proof would take more than a few seconds, as with more than about sixty terms, the search
+    continues from the best supports found by exchanges of terms, and warns with `Unproven`. Which
+    size is right is left to the selection rule.
+
+    Parameters
+    ----------
+    max_terms : int, default 6
+        Largest size of a support.
+    n_best : int, default 1
+        Number of supports of each size.
+
+    Raises
+    ------
+    ValueError
+        If a number is below one.
+
+    Notes
+    -----
+    For k = 0 ... max_terms,
+
+        minimise |y - X_S b|^2 over b and over all supports S of k terms
 
     Assumes Gaussian residuals that are independent from row to row, of one variance; then the best
-    support of a size is the likeliest. Which size is left to the selection rule. The work grows
-    with the number of subsets of up to max_terms terms: a library of 10 terms takes a tenth of a
-    millisecond, 20 terms with all sizes a tenth of a second. If a proof would take more than a few
-    seconds, as with more than about sixty terms, the search continues from the best supports found
-    by exchanges of terms, and warns with `Unproven`. n_best: number of supports of each size.
+    support of a size is the likeliest. The work grows with the number of subsets of up to max_terms
+    terms: a library of 10 terms takes a tenth of a millisecond, 20 terms with all sizes a tenth of
+    a second.
+
     Source: Furnival & Wilson 1974, doi:10.1080/00401706.1974.10489231.
 
+    Examples
+    --------
     >>> xx, xy = np.array([[1.0, 0.6], [0.6, 1.0]]), np.array([0.9, 0.3])
     >>> ep.BestSubset(max_terms=1, n_best=2).supports(xx, xy, 1.0).tolist()
     [[False, False], [True, False], [False, True]]

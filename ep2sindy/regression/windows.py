@@ -125,11 +125,26 @@ class WindowFunctions(Protocol):
 
 @dataclass(frozen=True)
 class Boxes:
-    """The thesis's test functions: 1 over `n_windows` random windows of `n_points` samples.
+    """Test functions of the thesis: 1 over random windows.
 
     Integrals use the trapezoidal rule; that of the derivative is the difference of x at the ends.
     Two points give the difference quotient and the mean of two samples: the differential form.
     Steps may be unequal.
+
+    Parameters
+    ----------
+    n_windows : int, default 3000
+        Number of windows.
+    n_points : int, default 100
+        Number of samples in a window.
+
+    Raises
+    ------
+    ValueError
+        If there is no window, or one of fewer than two points.
+
+    Notes
+    -----
     Source: the thesis, Eqs. 10 and 11.
     """
 
@@ -158,15 +173,34 @@ class Boxes:
 
 @dataclass(frozen=True)
 class Bumps:
-    """Smooth test functions phi = (1 - s^2)^p on windows that overlap, s from -1 to 1.
+    """Smooth test functions on windows that overlap.
 
-    half_width_s: half the length of a window, in s, or None to take it from the spectrum of
-    each state: the change point between signal and noise lies `tau_hat` standard deviations into
-    the tail of the bump's own spectrum (see `spectral_half_width`). The source takes 2. Narrower
-    bumps keep more of the fast components, and admit more noise, which smoothed states and the
-    covariance of the rows can handle.
-    overlap: successive windows are half_width / overlap apart. The power p makes phi fall to
-    1e-10 at the edge, so that the trapezoidal rule is practically exact.
+    Parameters
+    ----------
+    half_width_s : float, optional
+        Half the length of a window, in s. None takes it from the spectrum of each state.
+    tau_hat : float, default 0.7
+        Number of standard deviations at which the change point between signal and noise lies in the
+        tail of the bump's own spectrum, if half_width_s is None (`spectral_half_width`). The source
+        takes 2. Narrower bumps keep more of the fast components and admit more noise, which
+        smoothed states and the covariance of the rows can handle.
+    overlap : int, default 4
+        Successive windows are half_width / overlap apart.
+
+    Raises
+    ------
+    ValueError
+        If the half-width or tau_hat is not positive, or overlap is below 1.
+
+    Notes
+    -----
+    The test function is
+
+        phi(s) = (1 - s^2)^p,   s = (t - center) / half_width from -1 to 1
+
+    where the power p makes phi fall to 1e-10 at the edge, so that the trapezoidal rule is
+    practically exact.
+
     Source: Messenger & Bortz 2021, doi:10.1137/20M1343166.
     """
 

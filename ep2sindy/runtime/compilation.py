@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import atexit
 import re
 from collections.abc import Callable, Iterable
-from contextlib import suppress
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
-from shutil import copytree, rmtree
-from tempfile import mkdtemp
 from typing import Any
-from uuid import uuid4
 
 import numba
 from numba.core import config, cpu, event, options
@@ -22,7 +17,6 @@ from ep2sindy.runtime.user_cache import cache_folder
 from ep2sindy.trust.user_code import PACKAGE
 
 THIS = Path(__file__)
-SHARED = PACKAGE / "__pycache__" / "kernels"  # of `ep2sindy precompile --shared`
 IMPORT = re.compile(r"^from (ep2sindy(?:\.\w+)+) import", re.MULTILINE)
 
 ANNOUNCEMENT = "ep2sindy: compiling its kernels, once after installation (half a minute) ..."
@@ -82,49 +76,13 @@ def compiled(function: Callable | None = None, **options: Any) -> Any:
 
 @cache
 def _folder_of(sources: Path) -> str:
-    """Where the kernels of a folder of sources are kept; empty if they cannot be.
-
-    Kernels next to the package serve all users: they are copied, since numba reads only where it
-    may write.
-    """
+    """Where the kernels of a folder of sources are cached; empty if they cannot be."""
     files = {*sources.glob("*.py"), *_imported(_kernels_in(sources)), THIS}
-    name = f"{sources.name}_{digest(files)}"
-    beside = SHARED / name
     try:
-        folder = cache_folder("kernels", name)
+        return str(cache_folder("kernels", f"{sources.name}_{digest(files)}"))
     except OSError as error:
-        if not beside.is_dir():
-            _UNKEPT.append(f"; they are not kept, for {error}")
-            return ""
-        folder = _private_folder() / name
-    if beside.is_dir():
-        copied(beside, folder)
-    return str(folder)
-
-
-@cache
-def _private_folder() -> Path:
-    """A folder of this process alone, for kernels of users without a cache."""
-    folder = mkdtemp(prefix="ep2sindy-")
-    atexit.register(rmtree, folder, ignore_errors=True)
-    return Path(folder)
-
-
-def copied(source: Path, target: Path) -> None:
-    """Copy a folder, completely or not at all; one that is there stays."""
-    if target.exists():
-        return
-    temporary = target.with_name(f".{target.name}-{uuid4().hex}")
-    copytree(source, temporary)
-    with suppress(OSError):  # another process was faster
-        temporary.rename(target)
-    rmtree(temporary, ignore_errors=True)
-
-
-def folders() -> list[Path]:
-    """Where all kernels of the package are kept."""
-    subpackages = sorted({path.parent for path in _kernels_in(PACKAGE)})
-    return [Path(folder) for name in subpackages if (folder := _folder_of(name))]
+        _UNKEPT.append(f"; they are not kept, for {error}")
+        return ""
 
 
 def digest(files: Iterable[Path]) -> str:

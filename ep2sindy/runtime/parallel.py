@@ -1,20 +1,18 @@
-"""Execution of independent pieces of work: one after the other, on all cores, or on a cluster."""
+"""Execution of independent pieces of work: one after the other, or on all cores."""
 
 from __future__ import annotations
 
 import os
 import pickle
-import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import count, islice
 from pathlib import Path
 from threading import RLock
 from time import perf_counter
-from types import ModuleType
 from typing import Any, Protocol, TypeAlias, runtime_checkable
 
 import cloudpickle
@@ -27,9 +25,6 @@ from ep2sindy.trust.user_code import own_packages
 
 # Wall time that the start of processes costs, each with its imports.
 START_S = 4.5
-
-# Pieces submitted to a cluster per thread, including the running one; they queue with their data.
-AHEAD = 2
 
 Function: TypeAlias = Callable[[Any], Any]  # of a piece
 Numbered: TypeAlias = tuple[int, Any]  # the number of a piece, and the piece or its result
@@ -104,26 +99,19 @@ def _in_worker(code: bytes, parent: int, numbered: Numbered) -> Numbered:
     if os.getpid() != parent:  # inside a worker, joblib runs nested work in the same process
         end_with(parent)
         tqdm.set_lock(RLock())  # the default, a semaphore, causes a warning when the worker ends
-    return _sent_on_one_thread(code, numbered)
-
-
-def _sent_on_one_thread(code: bytes, numbered: Numbered) -> Numbered:
     return _on_one_thread(pickle.loads(code), numbered)
 
 
-def _with_its_code(function: Function, *packages: ModuleType) -> bytes:
-    """Pickle a function with the code of packages that workers cannot import by name.
-
-    These are the given packages, and the modules in the folder of the run that configs have named.
-    """
-    for package in (*packages, *own_packages()):
+def _with_its_code(function: Function) -> bytes:
+    """Pickle a function with the code of the modules in the folder of the run that configs name."""
+    for package in own_packages():
         cloudpickle.register_pickle_by_value(package)
     return cloudpickle.dumps(function)
 
 
 @dataclass(frozen=True)
 class Serial:
-    """Workers that compute one piece after the other, in this process."""
+    """Workers that compute one part after the other, in this process."""
 
     def run(self, function: Function, pieces: Iterable[Any]) -> Results:
         for numbered in enumerate(pieces):
@@ -137,7 +125,15 @@ ONE_BY_ONE = Serial()
 class Loky:
     """Workers in parallel processes on this machine.
 
-    n_jobs: their number; -1 for one per core.
+    Parameters
+    ----------
+    n_jobs : int, default -1
+        Number of processes. -1 means one per core.
+
+    Raises
+    ------
+    ValueError
+        If the number is zero or not whole.
     """
 
     n_jobs: int = -1
@@ -234,90 +230,3 @@ def run_alike(
         workers = workers if saved_s > START_S else ONE_BY_ONE
     for number, result in workers.run(function, waiting):
         yield number + n_first, result
-
-
-@dataclass(frozen=True)
-class Dask:
-    """Workers of a running dask scheduler, such as "tcp://10.0.0.1:8786".
-
-    If a worker dies, its piece goes to another one, as often as the scheduler allows (three times
-    by default). Workers need this package, and must see the same files under the same paths. A
-    function from another package is sent with its code. Needs the extra `cluster`.
-    Raises OSError if no scheduler with a worker answers at the address within `timeout_s`.
-    """
-
-    address: str
-    timeout_s: float = 10.0
-
-    def run(self, function: Function, pieces: Iterable[Any]) -> Results:
-        distributed = _distributed()
-        with self._client(distributed) as client:
-            yield from self._run(client, distributed.as_completed, function, pieces)
-
-    @contextmanager
-    def _client(self, distributed: Any) -> Iterator[Any]:
-        """Connect to a scheduler that has a worker, without making it dask's default client."""
-        client = None
-        try:
-            client = distributed.Client(self.address, timeout=self.timeout_s, set_as_default=False)
-            client.wait_for_workers(1, timeout=self.timeout_s)
-        except (OSError, ValueError) as error:
-            if client is not None:
-                client.close()
-            raise OSError(
-                f"a dask scheduler with a worker must answer at {self.address!r} within "
-                f"{self.timeout_s:g} s: {error}; start `dask scheduler` and `dask worker`, or "
-                "choose parallel=loky"
-            ) from error
-        with client:
-            yield client
-
-    def _run(
-        self, client: Any, as_completed: Callable, function: Function, pieces: Iterable[Any]
-    ) -> Results:
-        waiting, n_running = enumerate(pieces), 0
-        code = _with_its_code(function, *_package_of(function))
-
-        def submitted() -> list[Any]:
-            """Submit enough pieces to keep all threads busy, including those of new workers."""
-            n_threads = max(1, sum(client.nthreads().values()))
-            return [
-                client.submit(_sent_on_one_thread, code, each, pure=False)
-                for each in islice(waiting, max(0, AHEAD * n_threads - n_running))
-            ]
-
-        running = as_completed(loop=client.loop)
-        while True:
-            following = submitted()
-            running.update(following)
-            n_running += len(following)
-            if not n_running:
-                return
-            future = next(running)
-            n_running -= 1
-            result = future.result()
-            future.release()
-            yield result
-
-
-def _package_of(function: Function) -> list[ModuleType]:
-    """Package of a function as a list; empty for this package or the main program.
-
-    Those two need not be sent with their code.
-    """
-    inner: Any = function
-    while isinstance(inner, partial):
-        inner = inner.func
-    package = inner.__module__.partition(".")[0]
-    known = package in (__name__.partition(".")[0], "__main__")
-    return [] if known else [sys.modules[package]]
-
-
-def _distributed() -> Any:
-    try:
-        import distributed
-    except ImportError as error:
-        raise ValueError(
-            "parallel=dask needs dask.distributed: pip install 'ep2sindy[cluster]'"
-        ) from error
-    return distributed

@@ -90,22 +90,47 @@ MAX_ROUNDS = 5
 
 @dataclass(frozen=True)
 class EBIC:
-    """The extended Bayesian criterion: a priori all sizes of support are equally likely.
+    """Select by the extended Bayesian information criterion: a priori all sizes are equally likely.
 
-    score = n log(RSS / n) + k log n + 2 gamma log(number of supports of k terms). Libraries are
-    nested by degree, and the supports are counted in the smallest one that holds the candidate's
-    terms, so that simple terms do not pay for the many terms of high degree.
-    Assumes Gaussian residuals. Where the rows' covariance is known (`Weak`), the residuals must be
-    white after weighting by it. Where it is not (`Differential`), they must be independent from row
-    to row; neighbouring rows of a smoothed series are not, and too many terms are then kept.
-    coarsening: no model is exact, and with enough rows any discrepancy becomes significant. The
-    likelihood is therefore raised to the power 1 / (1 + n/coarsening), so that evidence stops
-    growing at about that many rows. None uses the full likelihood.
-    With gamma=0 and coarsening=None it is Schwarz's criterion, BIC, for which all models are
-    equally likely a priori. There are many more models of middle size than small ones, so with a
-    library of any size BIC keeps too many terms.
+    Parameters
+    ----------
+    gamma : float, default 1.0
+        Weight of the number of supports of each size, zero or more. 1 makes all sizes equally
+        likely. 0, with coarsening=None, gives Schwarz's criterion BIC, for which all models are
+        equally likely a priori; it selects too many terms from a library of any size, since there
+        are many more models of middle size than small ones.
+    coarsening : float or None, default 60.0
+        Number of rows at which evidence stops growing. No model is exact, and with enough rows any
+        discrepancy becomes significant; the likelihood is therefore raised to the power 1 / (1 + n
+        / coarsening). None uses the full likelihood.
+
+    Raises
+    ------
+    ValueError
+        If gamma is negative, or coarsening is not above 1.
+
+    Notes
+    -----
+    Minimises, over the candidates of one equation,
+
+        score = m log(RSS / n) + k log m + 2 gamma log N_k,   m = n / (1 + n / coarsening)
+
+    with n rows, k terms, the residual sum of squares RSS, and the number N_k of supports of k terms
+    in the library up to the highest degree of the candidate, so that simple terms do not pay for
+    the many terms of high degree. Assumes Gaussian residuals. Where the covariance of the rows is
+    known (`Weak`), the residuals must be white after weighting by it. Where it is not
+    (`Differential`), they must be independent from row to row; neighbouring rows of a smoothed
+    series are not, and too many terms are then selected.
+
     Source: Chen & Chen 2008, doi:10.1093/biomet/asn034; Miller & Dunson 2019,
     doi:10.1080/01621459.2018.1469995; Schwarz 1978, doi:10.1214/aos/1176344136.
+
+    Examples
+    --------
+    >>> run = ep.lotka_volterra().trajectory(noise=0.02, rng=0)
+    >>> found = ep.discover(run, method=ep.Regression(selection=ep.EBIC(gamma=0.5)))
+    >>> found.chosen["x"].terms
+    ('x', 'x*y')
     """
 
     gamma: float = 1.0
@@ -195,10 +220,23 @@ def _fit_all(
 
 @dataclass(frozen=True)
 class Evidence:
-    """Select by -2 log likelihood of the trajectories plus a complexity penalty.
+    """Select by -2 log likelihood of the trajectories plus a penalty for complexity.
 
     A `TrajectorySearch` ranks its own candidates by this value. Fronts of regressions do not have
     it.
+
+    Notes
+    -----
+    Minimises
+
+        -2 log L + sum over terms j of (log n + 2 log N_q + 2 log(2) (q - 1))
+
+    with the likelihood L, n samples, the degree q of term j (at least 1), and the number N_q of
+    terms up to that degree. Every degree above the first is half as likely a priori as the one
+    below.
+
+    Source: Schwarz 1978, doi:10.1214/aos/1176344136, for log n; Chen & Chen 2008,
+    doi:10.1093/biomet/asn034, for the count.
     """
 
     label: ClassVar[str] = "deviance"
@@ -213,19 +251,39 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Knee:
-    """Selects the candidate closest to zero error and zero terms: the thesis's rule.
+    """Select the candidate closest to zero error and zero terms: the rule of the thesis.
 
-    score = sqrt((1 - R2)^2 + (n_terms / n_norm)^2). For n_norm="library" it is the number of terms
-    in the library (the thesis's Eq. 9); for "max_terms" it is the largest candidate's number plus
-    one (used for the thesis's Tables II and III). Assumes that a term worth having raises R2 by
-    about one step of n_terms / n_norm: any other is dropped, by construction.
-    scale: "log" takes the logarithm of the error, so that a small term of an exact law counts:
-    score = sqrt(((log e - log e_min) / (log e_max - log e_min))^2 + (n_terms / n_norm)^2). That
-    assumes that errors span orders of magnitude: the largest fall sets the scale, and a true term
-    that lowers the error by less than one step of it is dropped.
+    Parameters
+    ----------
+    n_norm : str, default 'library'
+        "library" divides the number of terms by that of the library (the thesis's Eq. 9),
+        "max_terms" by the largest candidate's number plus one (the thesis's Tables II and III).
+    scale : str, default 'linear'
+        "linear" takes the error 1 - R2. "log" takes its logarithm, so that a small term of an exact
+        law counts.
+
+    Raises
+    ------
+    ValueError
+        If n_norm or scale is another word.
+
+    Notes
+    -----
+    Minimises, over the candidates of one equation,
+
+        linear: score = sqrt((1 - R2)^2 + (n_terms / n_norm)^2)
+        log:    score = sqrt((log(e / e_min) / log(e_max / e_min))^2 + (n_terms / n_norm)^2)
+
+    with e = 1 - R2. The linear scale assumes that a term worth having raises R2 by about one step
+    of n_terms / n_norm: any other is dropped, by construction. The logarithmic scale assumes that
+    errors span orders of magnitude: a true term that lowers the logarithm by less than one step of
+    the largest fall is dropped.
+
     Source: the thesis, Eq. 9; a corner of the curve of error and size, as Hansen 1992,
     doi:10.1137/1034115, takes it for regularisation.
 
+    Examples
+    --------
     >>> rule, run = ep.Regression(selection=ep.Knee()), ep.lotka_volterra().trajectory()
     >>> list(ep.discover(run, method=rule).model.terms("x"))
     ['x', 'x*y']

@@ -83,39 +83,80 @@ MIN_RUN, MAX_RUN = 16.0, 30.0
 
 @dataclass(frozen=True)
 class FreeRunScore:
-    """Assess systems by free runs; the smallest that is sustained where it was not fitted wins.
+    """Test systems by free runs; the smallest that sustains its oscillation on held-out data wins.
 
-    The records are split into `n_folds`. Every combination of candidates, one per equation, is
-    refined on windows of `window_periods` in all folds but one, then run freely over the fold held
-    out, in turn for every fold. A run starts on the data's cycle at the phase where the held-out
-    part begins, not at its first sample, whose noise is not the model's fault. A model with inputs
-    starts at the smoothed sample instead. A system is sustained if frequency, amplitudes and
-    waveform stay within `bounds` of the data's cycle in every run. Self-sustained systems within
-    `margin` come first; among these the smallest, and among equals the one with the best waveform,
-    is refined on windows of all data and run over the longest record. It wins if it is sustained
-    there too, on a cycle that nine of ten starts around it reach; if fewer do, one that they reach
-    wins with the same number of coefficients or one more, else that of least size and most such
-    starts. A system on a neutral cycle wins only if no equal or larger system on an attracting
-    cycle follows the data as well. Size is the number of free coefficients. If no system is
-    sustained, the one that deviates least wins, and the note says so. Neither R2 nor the loss of
-    the windows decides which systems are sustained: they are blind to where a trajectory ends. Only
-    if some systems follow the samples to rounding, because the truth is in the library, these
-    compete alone.
+    The records are split into folds. Every combination of candidates, one per equation, is refined
+    on windows in all folds but one, and then integrated freely over the held-out fold, in turn for
+    every fold. A system is sustained if frequency, amplitudes and waveform stay within `bounds` of
+    the data's cycle in every run.
 
-    Windows of the fold held out are assessed instead if a record has no period, holds fewer than
-    six, or spirals outward or inward throughout, as there is no cycle to compare with; see
-    `WindowsLeftOut`. Of the systems that follow them as well as any, the smallest wins.
-    score = the largest deviation from the cycle, in units of its bound, or the error over windows,
-    in units of the largest that cannot be distinguished from the least; at most 10.
-    bounds: None tests windows of every record, for cycles that do not repeat, such as chaos.
-    margin: systems that deviate by no more than this fraction of the bounds come first, even if
-    others are smaller: a system that barely stays within the bounds here will leave them in another
-    record. assessed: states whose cycle counts, for example the one that was measured if the others
-    are derived from it; None takes all. n_starts: number of runs over every held-out part for
-    models without inputs, at phases spread over the period; all must end on the cycle.
-    max_combinations: of more, the most promising are tried, those whose candidates rank best in
-    their own fronts; the note says so. n_confirmed: most systems to refine on all data. seed: of
-    the random windows.
+    The sustained systems that deviate by at most `margin` come first, the smallest of them before
+    the others; size is the number of free coefficients, and of equal sizes the best waveform comes
+    first. The first one is refined on windows of all data and run over the longest record. It wins
+    if it is sustained there too, on a cycle that nine of ten starts around it reach. If fewer
+    starts reach it, a system whose cycle they reach wins if it has the same number of coefficients
+    or one more; otherwise that of least size and most such starts wins. A system on a neutral cycle
+    wins only if no equal or larger system on an attracting cycle follows the data as well. If no
+    system is sustained, the one that deviates least wins, and the note says so.
+
+    Parameters
+    ----------
+    bounds : FreeRunBounds or None, default FreeRunBounds()
+        Largest deviations at which a run counts as sustained. None tests windows of every record,
+        for cycles that do not repeat, such as chaos.
+    n_folds : int, default 3
+        Number of folds, two or more.
+    n_windows : int, default 20
+        Number of windows on which a system is refined.
+    window_periods : float, default 2.0
+        Length of a window, in periods.
+    margin : float, default 0.6
+        Systems that deviate by no more than this fraction of the bounds come first, even if others
+        are smaller: a system that barely stays within the bounds here will leave them in another
+        record.
+    n_confirmed : int, default 8
+        Most systems to refine on all data.
+    seed : int, default 0
+        Of the random windows.
+    max_combinations : int, default 4096
+        If there are more combinations, the most promising are tested, those whose candidates rank
+        best in their own fronts; the note says so.
+    assessed : sequence of str, optional
+        States whose cycle counts, for example the measured one if the others are derived from it.
+        None takes all.
+    n_starts : int, default 1
+        Number of runs over every held-out part for models without inputs, at phases spread over the
+        period. All must end on the cycle.
+
+    Raises
+    ------
+    ValueError
+        If a number is too small, or the margin does not lie between 0 and 1.
+
+    Notes
+    -----
+    The score of a combination is
+
+        score = max over runs and states s of
+                |f / f_data - 1| / b_f, |A_s / A_s,data - 1| / b_A, w_s / b_w
+
+    with frequency f, standard deviation A_s, waveform error w_s in standard deviations, and the
+    bounds b; or the error over windows in units of the largest that cannot be distinguished from
+    the least; at most 10. A run starts on the data's cycle at the phase where the held-out part
+    begins, not at its first sample, whose noise is not the model's error; a model with inputs
+    starts at the smoothed sample. If a record has no period, holds fewer than six, or spirals
+    outward or inward throughout, windows of the held-out fold are tested instead
+    (`WindowsLeftOut`), and the smallest of the systems that follow them as well as any wins. If
+    some systems follow the samples to rounding, because the truth is in the library, only these
+    compete.
+
+    Examples
+    --------
+    >>> run = ep.lotka_volterra().trajectory(noise=0.02, rng=0)
+    >>> library = ep.polynomial(["x", "y"]).only({"x": ["x", "x*y"], "y": ["y", "x*y"]})
+    >>> rule = ep.Regression(selection=ep.FreeRunScore(n_folds=2))
+    >>> ep.discover(run, library, rule).chosen["x"].terms
+    ('x', 'x*y')
     """
 
     bounds: FreeRunBounds | None = field(default_factory=FreeRunBounds)

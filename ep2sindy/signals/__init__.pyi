@@ -8,4 +8,3 @@ from ep2sindy.signals.attractor import mean_cycle as mean_cycle
 from ep2sindy.signals.embedding import embed_alike as embed_alike
 from ep2sindy.signals.driving import add_drive as add_drive
 from ep2sindy.signals.signal import prepare_signal as prepare_signal
-from ep2sindy.signals.delay import Delay as Delay

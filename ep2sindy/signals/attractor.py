@@ -89,13 +89,30 @@ def find_cycle(
 ) -> Cycle | None:
     """Period and waveform of a record; None if the record is not periodic.
 
-    The period is that of the state whose spectrum has the sharpest line. The phase of this state
-    is followed by demodulation. The slope of the phase is then adjusted until the waveform, a
-    Fourier series in the phase, fits all samples best; white noise averages out.
+    The period is that of the state whose spectrum has the sharpest line. The phase of this state is
+    followed by demodulation. The slope of the phase is then adjusted until the waveform, a Fourier
+    series in the phase, fits all samples best; white noise averages out.
 
-    t: (samples,) in s. n_harmonics: None chooses as many as the samples support (BIC).
-    Returns None for fewer than three periods, or if the waveform explains less than half of the
-    variance, as for chaos, noise or a transient.
+    Parameters
+    ----------
+    t : (samples,) array
+        Times in s.
+    states : (samples, n_states) array
+        Samples of the states.
+    n_harmonics : int, optional
+        Number of harmonics of the waveform. None chooses as many as the samples support (BIC).
+
+    Returns
+    -------
+    Cycle or None
+        The cycle. None for fewer than three periods, or if the waveform explains less than half of
+        the variance, as for chaos, noise or a transient.
+
+    Notes
+    -----
+    Over the slope of the phase and the coefficients a_m of the waveform,
+
+        minimise sum_k |x(t_k) - sum_m a_m exp(i m phase(t_k))|^2
     """
     spread = states.std(axis=0)
     # Rounding errors of a constant state are no oscillation.
@@ -175,8 +192,24 @@ def mean_cycle(run: Trajectory) -> Trajectory:
 
     White noise averages out over the periods, and so does all that does not repeat, such as a
     transient. Inputs stay as they are.
-    Raises ValueError for a run that `find_cycle` finds no cycle in.
 
+    Parameters
+    ----------
+    run : Trajectory
+        A record that oscillates.
+
+    Returns
+    -------
+    Trajectory
+        The run with the mean waveform as states.
+
+    Raises
+    ------
+    ValueError
+        If `find_cycle` finds no cycle in the run.
+
+    Examples
+    --------
     >>> t = np.linspace(0.0, 300.0, 3001)
     >>> noise = np.random.default_rng(0).normal(size=3001)
     >>> quiet = ep.signals.mean_cycle(ep.Trajectory(t, (np.sin(t) + noise)[:, None], ["x"]))

@@ -61,10 +61,28 @@ N_AHEAD, N_LAGS = 12, 3  # steps in a period, and how many of them, by which a s
 def add_drive(run: Run, period_s: float) -> Trajectory:
     """The run with a drive of known period as inputs `cos_drive` and `sin_drive`.
 
-    Both are needed since the phase of the drive is not known; what is a sum of harmonics is reached
-    by products of them. run: as `discover` takes it. period_s: in s, of any unit of time's run.
-    Raises ValueError for a period that is not positive, or a run that has these inputs already.
+    Both are needed since the phase of the drive is not known. Products of the two give its
+    harmonics.
 
+    Parameters
+    ----------
+    run : run
+        A run as `discover` takes it.
+    period_s : float
+        Period of the drive in s.
+
+    Returns
+    -------
+    Trajectory
+        The run with the two further inputs.
+
+    Raises
+    ------
+    ValueError
+        If the period is not positive, or the run has these inputs already.
+
+    Examples
+    --------
     >>> t = np.linspace(0.0, 9.0, 181)
     >>> run = ep.signals.add_drive(ep.Trajectory(t, np.sin(t)[:, None], ["x"]), period_s=3.0)
     >>> run.input_names, run.inputs[0].tolist()

@@ -217,14 +217,41 @@ def embed(
     """Make states of one measured signal, so that equations can be found for it.
 
     A single first-order equation cannot oscillate, so an oscillating signal needs a second state.
-    run: a run as `discover` takes it, or a signal that is prepared (`prepare_signal`). how: "rate",
-    "derivative", "delays" or "hidden", see `Embedding`; "auto" takes the growth rate of a positive
-    signal and the derivative of any other, or delays if noise drowns the derivative. signal: the
-    variable; None takes the only state. n_states, harmonics: see `Embedding`. decimate, detrend:
-    see `prepare_signal`.
-    Raises ValueError for a signal that does not oscillate, or holds under six periods or under six
-    samples a period, and for settings that do not suit it.
 
+    Parameters
+    ----------
+    run : run or Signal
+        A run as `discover` takes it, or a signal from `ep.signals.prepare_signal`.
+    how : str, default 'auto'
+        "rate": the signal x and its growth rate g, so that x' = x g is known. "derivative": x and
+        its derivative v, so that x' = v is known. "delays": x and x a quarter of a period before.
+        "hidden": x by itself; `discover` finds the other states. "auto" takes the rate for a
+        positive signal and the derivative for any other, or delays if noise hides the derivative.
+    signal : str, optional
+        Name of the variable. None takes the only state.
+    n_states : int, default 2
+        Number of states in all. More than two adds further derivatives or delays.
+    harmonics : float, default HARMONICS
+        Number of harmonics of the period that the smoother follows.
+    decimate : int, "auto" or None, default "auto"
+        Number of samples that are replaced by their mean, see `ep.signals.prepare_signal`.
+    detrend : bool or "auto", default "auto"
+        Whether a straight line is subtracted, see `ep.signals.prepare_signal`.
+
+    Returns
+    -------
+    Embedded
+        The states along the run, what is known of their equations, and `library`, which makes a
+        library for them.
+
+    Raises
+    ------
+    ValueError
+        If the signal does not oscillate, holds under six periods or under six samples a period, or
+        a setting does not suit it.
+
+    Examples
+    --------
     >>> t = np.linspace(0.0, 60.0, 1201)
     >>> states = ep.embed((t, np.sin(t)))
     >>> states.run.state_names, states.known
@@ -243,10 +270,29 @@ def embed_alike(
 ) -> list[Embedded]:
     """Make states of the same signal of several runs, by one embedding.
 
-    Equations of one form can then hold for all. "auto" takes the growth rate if the signal is
-    positive in every run, and delays if noise drowns the derivative in one.
-    signals: as prepared. how, n_states, harmonics: see `embed`.
-    Raises ValueError for no signal.
+    Equations of one form can then hold for all.
+
+    Parameters
+    ----------
+    signals : sequence of Signal
+        Signals from `prepare_signal`.
+    how : str, default 'auto'
+        As for `ep.embed`. "auto" takes the growth rate if the signal is positive in every run, and
+        delays if noise hides the derivative in one.
+    n_states : int, default 2
+        Number of states in all.
+    harmonics : float, default HARMONICS
+        Number of harmonics of the period that the smoother follows.
+
+    Returns
+    -------
+    list of Embedded
+        The states along each run.
+
+    Raises
+    ------
+    ValueError
+        If there is no signal.
     """
     if not signals:
         raise ValueError("an embedding needs a signal or more, got an empty list")

@@ -55,20 +55,37 @@ class LogEstimate:
 class LogSmoother:
     """Smoother for a positive signal with additive white noise and a smooth logarithm.
 
-    It minimises, over logarithms f,
+    A sample in a trough no higher than the noise says little about the logarithm there and has
+    little weight; it may be zero or negative.
 
-        sum_i (x_i - exp f(t_i))^2 + (1 / ratio) integral (d^3 f / dt^3)^2 dt.
+    Parameters
+    ----------
+    finest_s : float, optional
+        Shortest memory of the process in s, where the signal is at its mean, as for
+        `KalmanSmoother`. None leaves it to the data.
+    coarsest_s : float, optional
+        Longest memory in s.
 
-    The logarithm is a twice integrated Wiener process, as in `KalmanSmoother`; the samples are
-    its exponential plus noise of constant standard deviation. A sample in a trough no higher than
-    the noise says little about the logarithm there and has little weight; it may be zero or
-    negative. The mode of the posterior is found by the Gauss-Newton method, each step of which
-    solves for a `WienerProcess` with weights; the ratio of process to measurement noise is the most
-    likely one (Laplace's approximation).
-    finest_s, coarsest_s: bounds on the memory of the process, in s, where the signal is at its
-    mean, as for `KalmanSmoother`. None leaves it to the data.
+    Raises
+    ------
+    ValueError
+        If the bounds are not positive times.
+
+    Notes
+    -----
+    Over logarithms f,
+
+        minimise sum_i (x_i - exp f(t_i))^2 + (1 / ratio) integral (d^3 f / dt^3)^2 dt
+
+    The logarithm is a twice integrated Wiener process, as in `KalmanSmoother`; the samples are its
+    exponential plus noise of constant standard deviation. The mode of the posterior is found by the
+    Gauss-Newton method, each step of which solves for a `WienerProcess` with weights; the ratio of
+    process to measurement noise is the most likely one (Laplace's approximation).
+
     Source: Rasmussen & Williams 2006, Gaussian Processes for Machine Learning, section 3.4.
 
+    Examples
+    --------
     >>> t = np.linspace(0.0, 6.0, 301)
     >>> noisy = np.exp(np.sin(t)) + 0.05 * np.random.default_rng(0).normal(size=301)
     >>> found = ep.signals.LogSmoother().estimate(t, noisy)
@@ -87,7 +104,22 @@ class LogSmoother:
     ) -> LogEstimate:
         """Smooth samples of a signal that is positive apart from noise; steps may be unequal.
 
-        Raises ValueError for fewer than eight samples, or a mean that is not positive.
+        Parameters
+        ----------
+        t : (samples,) array
+            Times in s.
+        x : (samples,) array
+            Samples of the signal.
+
+        Returns
+        -------
+        LogEstimate
+            The logarithm and its derivative at the samples.
+
+        Raises
+        ------
+        ValueError
+            If there are fewer than eight samples, or the mean is not positive.
         """
         steps, step_s = scale_steps(t, x, MIN_SAMPLES)
         mean = float(x.mean())

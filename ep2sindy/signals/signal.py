@@ -120,14 +120,33 @@ def prepare_signal(
 ) -> Signal:
     """Make a trace of one variable of a run.
 
-    run: as `discover` takes it; its inputs stay next to the signal. signal: None takes the only
-    state. decimate: number of samples that are replaced by their mean; "auto" leaves a hundred per
-    period, None leaves all. detrend: whether to subtract the straight line that the signal follows
-    next to its cycle, and keep the mean; "auto" does so if the line is certain, and large next to
-    the troughs of a positive signal or next to the standard deviation of any other. Raises
-    ValueError for a signal that does not oscillate, under six periods or under six samples a
-    period, or a wrong setting.
+    Parameters
+    ----------
+    run : run
+        A run as `discover` takes it. Its inputs stay next to the signal.
+    signal : str, optional
+        Name of the variable. None takes the only state.
+    decimate : int, "auto" or None, default "auto"
+        Number of samples that are replaced by their mean. "auto" leaves a hundred per period, None
+        takes all samples.
+    detrend : bool or "auto", default "auto"
+        Whether the straight line that the signal follows next to its cycle is subtracted; the mean
+        stays. "auto" does so if the line is certain, and large compared with the troughs of a
+        positive signal or with the standard deviation of any other.
 
+    Returns
+    -------
+    Signal
+        The trace, with its period and noise.
+
+    Raises
+    ------
+    ValueError
+        If the signal does not oscillate, holds under six periods or under six samples a period, or
+        a setting is wrong.
+
+    Examples
+    --------
     >>> t = np.linspace(0.0, 1e-3, 2001)
     >>> ep.signals.prepare_signal(ep.Trajectory(t, 3 + np.sin(6e4*t)[:, None], ["I"])).is_positive
     True

@@ -92,12 +92,30 @@ class NoSmoothing:
 
 @dataclass(frozen=True)
 class SavitzkyGolay:
-    """Fit a least-squares polynomial of `order` over `window` samples around every sample.
+    """Fit a least-squares polynomial over a window of samples around every sample.
 
     The derivative is the second-order difference of the smoothed samples (the thesis's
-    "smoothed finite difference"). Near the ends the first and the last full window are used, so
-    nothing wraps around. With unequal steps the polynomial is fitted to the actual times.
-    Raises ValueError unless window is odd and above order.
+    "smoothed finite difference"). Near the ends the first and the last full window are used. With
+    unequal steps the polynomial is fitted to the actual times.
+
+    Parameters
+    ----------
+    window : int, default 11
+        Number of samples in a window, odd.
+    order : int, default 3
+        Degree of the polynomial, below the window.
+
+    Raises
+    ------
+    ValueError
+        Unless window is odd and above order.
+
+    Notes
+    -----
+    At each sample i, the polynomial p of degree `order` minimises
+
+        sum over k in the window about i: (values_k - p(t_k))^2
+
     Source: Savitzky & Golay 1964, doi:10.1021/ac60214a047.
     """
 
@@ -301,22 +319,39 @@ class KalmanEstimate:
 class KalmanSmoother:
     """Smoother for a twice integrated Wiener process with white noise; steps may be unequal.
 
-    It minimises, over signals f,
+    Each column has its own ratio of process to measurement noise.
 
-        sum_i (values_i - f(t_i))^2 + (1 / ratio) integral (d^3 f / dt^3)^2 dt,
+    Parameters
+    ----------
+    log10_ratio : float, optional
+        Logarithm of the ratio for all columns. None takes the most likely ratio of each column.
+    finest_s : float, optional
+        Shortest memory of the process in s, for the most likely ratio. Faster components count as
+        noise. None sets no bound.
+    coarsest_s : float, optional
+        Longest memory in s. On pulses, or with few samples to a period, the likelihood has a second
+        maximum where the whole signal counts as noise; this bound keeps the search away from it.
+        None sets no bound.
 
-    so that f, the mean of the process given all samples, is the quintic smoothing spline. Each
-    column has its own ratio of process to measurement noise: the most likely one, unless
-    log10_ratio sets it for all columns. The initial state is diffuse, so a parabola passes
-    unchanged.
-    finest_s, coarsest_s: bounds on the memory of the process, in s, for the most likely ratio.
-    Components faster than `finest_s` count as noise. On pulses, or with few samples to a period,
-    the likelihood has a second maximum where the whole signal counts as noise; `coarsest_s` keeps
-    the search away from it. None sets no bound.
-    Raises ValueError for a log10_ratio outside [-14, 4], or bounds that are not positive times.
+    Raises
+    ------
+    ValueError
+        If log10_ratio lies outside [-14, 4], or the bounds are not positive times.
+
+    Notes
+    -----
+    Over signals f,
+
+        minimise sum_i (values_i - f(t_i))^2 + (1 / ratio) integral (d^3 f / dt^3)^2 dt
+
+    so that f, the mean of the process given all samples, is the quintic smoothing spline. The
+    initial state is diffuse, so a parabola passes unchanged.
+
     Source: Wahba 1978, doi:10.1111/j.2517-6161.1978.tb01050.x; Durbin & Koopman 2012,
     doi:10.1093/acprof:oso/9780199641178.001.0001.
 
+    Examples
+    --------
     >>> t = np.linspace(0.0, 6.0, 301)
     >>> noisy = np.sin(t) + 0.1 * np.random.default_rng(0).normal(size=301)
     >>> found = ep.signals.KalmanSmoother().estimate(t, noisy[:, None])
@@ -343,9 +378,23 @@ class KalmanSmoother:
 
         `smooth` and `derivative` return parts of this result, each at the full cost.
 
-        t: (samples,) in s. A constant column is returned unchanged: its noise and derivative are
-        zero, and its ratio is the smoothest one unless log10_ratio is set.
-        Raises ValueError for fewer than five samples.
+        Parameters
+        ----------
+        t : (samples,) array
+            Times in s.
+        values : (samples, columns) array
+            Samples. A constant column is returned unchanged: its noise and derivative are zero, and
+            its ratio is the smoothest one unless log10_ratio is set.
+
+        Returns
+        -------
+        KalmanEstimate
+            The smooth signal, its derivative and the noise, by column.
+
+        Raises
+        ------
+        ValueError
+            If there are fewer than five samples.
         """
         steps, step_s = scale_steps(t, values, MIN_SAMPLES)
         process, spread = WienerProcess.at(steps), values.max(axis=0) - values.min(axis=0)

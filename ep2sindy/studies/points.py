@@ -49,7 +49,7 @@ from ep2sindy.studies.point_sources import (
 )
 from ep2sindy.studies.quantity_tables import Published, add_quantities, read_published
 from ep2sindy.studies.resume import resumed
-from ep2sindy.studies.source import Source, compile_kernels
+from ep2sindy.studies.source import Source
 from ep2sindy.studies.structures import Terms, terms_of
 from ep2sindy.studies.study import Count, Positive
 
@@ -134,8 +134,6 @@ class Study:
             report.say(f"{words}: {', '.join(self._given.left_out)}")
         self._report_known(report)
         sources = self._given.sources
-        with report.progress(None, "", "kernels, compiled once"):
-            compile_kernels([source.source.data for source in sources])
         with resumed(self.keep, report, self.parallel) as workers:
             inputs = self.source.inputs([self._given_models(self.models or {})[0]])
             opened, signal = open_points(sources, inputs, workers=workers, report=report), None

@@ -223,7 +223,7 @@ def found_regimes(regimes: Regimes, points: str) -> Result:
     limit = ", as many as max_regimes allows: the points may bear more" if regimes.at_limit else ""
     unsure = float((regimes.confidence < UNSURE).sum() / regimes.confidence.count())
     return Result(
-        f"Found: {count}{limit}; confidence below {UNSURE:g} at {unsure:.0%} of points",
+        f"Found: {count}{limit}; confidence below {UNSURE:g} at {100.0 * unsure:.0f} % of points",
         [*largest, Text(points)],
         load='xarray.open_dataset("{}/pointwise.nc")',
         picture="regimes",
@@ -234,9 +234,10 @@ def _add_regime(report: Report, regimes: Regimes, regime: int) -> None:
     """Add a part on one regime: its equations, and the spread of coefficients over its points."""
     rows = regimes.table[regimes.table["regime"] == regime]
     first = rows.iloc[0]
+    unsure = f"below {UNSURE:g} at {100.0 * first['unsure']:.0f} %"
     report.section(
         f"Regime {regime}: {first['n_points']} point{'s' if first['n_points'] > 1 else ''}, "
-        f"confidence {first['confidence']:.2f}, below {UNSURE:g} at {first['unsure']:.0%}",
+        f"confidence {first['confidence']:.2f}, {unsure}",
         *(Equation(s, terms, on_screen=True) for s, terms in regimes.equations(regime).items()),
         level=3,
     )
@@ -268,6 +269,6 @@ def terms_table(result: xr.Dataset) -> pd.DataFrame:
 def _readable(rows: pd.DataFrame) -> pd.DataFrame:
     """The columns that are shown, under their headings, with fractions in percent."""
     fractions = [name for name in ("selected", "inclusion", "in_support") if name in rows]
-    percent = {name: [f"{fraction:.0%}" for fraction in rows[name]] for name in fractions}
+    percent = {name: [f"{100.0 * fraction:.0f} %" for fraction in rows[name]] for name in fractions}
     shown = [name for name in HEADINGS if name in rows]
     return rows.assign(**percent)[shown].rename(columns=HEADINGS)

@@ -1,16 +1,13 @@
-"""Run the simulator once, or over any of its parameters, and show the results: `+exp=simulate`.
-
-A single run shows where its power goes and how it breathes. A scan shows every combination of
-some settings.
-"""
+"""Run the simulator, and show where the power goes and how the discharge breathes."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
+from math import nan
 from operator import itemgetter
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -20,25 +17,14 @@ from ep2sindy.figures import breathing
 from ep2sindy.report.document import Result, Table, Text, places
 from ep2sindy.report.report import Report
 from ep2sindy.report.results import Metric, ResultTable, View, percent
-from ep2sindy.runtime.parallel import Workers, collect
 from ep2sindy.signals.spectrum import power_spectrum
-from ep2sindy.studies.scan import (
-    BALANCE,
-    FAILED,
-    MERITS,
-    VERDICT,
-    Simulated,
-    add_scan,
-    check_simulation,
-    number,
-    run_point,
-    scan_points,
-)
-from ep2sindy.studies.source import compile_kernels, report_simulation, status_text
-from ep2sindy.studies.study import Check, Deferred, Positive, PositiveOrAll
+from ep2sindy.studies.source import is_simulation, report_simulation, status_text
+from ep2sindy.studies.study import Deferred, Positive, PositiveOrAll
 from ep2sindy.thruster.axial.output import POWERS
 from ep2sindy.thruster.cache import write
 from ep2sindy.thruster.verdict import TRANSIT_HZ
+
+Simulated = Mapping[str, Any]  # attributes of a simulation: its status, and numbers in SI
 
 MIN_SAMPLES = 16  # fewer samples cannot be drawn
 AVERAGED = " Averaged over r by area."
@@ -53,10 +39,40 @@ CAPTIONS = {
     "are ionised, and fill it again. Dashed: the channel's exit.",
 }
 BRIEF = ("I_d_mean", "I_d_std", "thrust_N", "isp_s", "mass_balance")
+BALANCE = "balance: (out + stored)/in"
+
+
+def number(key: str, heading: str, form: Any, view: View = View.ALL) -> Metric[Simulated]:
+    """A number of a simulation; NaN if it has none, as a run that diverged."""
+    return Metric(key, lambda run: float(run.get(key, nan)), view, heading, form)
+
+
+def _millinewton(value: float) -> str:
+    return "-" if value != value else f"{1e3 * value:.1f} mN"
+
+
+def _cycles(count: float) -> str:
+    return "-" if count != count else f"{count:g} cycle{'s' if count > 1 else ''}"
+
+
+def _cycle(strength: str) -> str:
+    return "-" if strength == "none" else strength
+
+
 PERFORMANCE: list[Metric[Simulated]] = [
-    *VERDICT,
+    Metric("status", itemgetter("status"), View.SHOWN),
+    Metric("cycle", lambda run: run.get("cycle", "none"), View.SHOWN, format=_cycle),
     Metric("initial", lambda run: run.get("initial"), View.SHOWN, "start"),
-    *MERITS,
+    number("I_d_mean", "mean discharge current", "{:.2f} A"),
+    number("I_d_std", "its standard deviation", "{:.2f} A"),
+    number("f_kHz", "frequency", "{:.2f} kHz"),
+    number("peak_spread", "spread of the peaks", percent(1)),
+    number("multiplicity", "peaks repeat after", _cycles),
+    number("thrust_N", "thrust", _millinewton),
+    number("isp_s", "specific impulse", "{:.0f} s"),
+    number("anode_efficiency", "anode efficiency", percent(1)),
+    number("mass_balance", "mass balance", "{:.4f}"),
+    number("energy_balance", "energy balance", "{:.4f}"),
     number("std_fraction", "standard deviation over mean current", percent(0), View.SHOWN),
     number("I_beam_mean", "mean ion beam current", "{:.2f} A"),
     number("beam_fraction", "ion beam over discharge current", percent(0), View.SHOWN),
@@ -64,19 +80,6 @@ PERFORMANCE: list[Metric[Simulated]] = [
     Metric("rates", lambda run: run.get("rates"), View.SHOWN, "rates of the propellant"),
     number("half_angle_deg", "mean half-angle of the plume", "{:.1f} degrees", View.SHOWN),
     Metric("n_samples", itemgetter("n_samples")),
-]
-
-
-def _is_scan(value: Any) -> bool:
-    if not isinstance(value, dict) or not value:
-        return value is None
-    lists = all(isinstance(each, list) and each for each in value.values())
-    return lists and all(each not in v[:k] for v in value.values() for k, each in enumerate(v))
-
-
-Scan = Annotated[
-    Mapping[str, Sequence[Any]] | None,
-    Check("like {operating_point.voltage: [250,300]}, each value once, or null", _is_scan),
 ]
 
 
@@ -90,29 +93,12 @@ class Windowed:
 
 @dataclass(frozen=True, eq=False)
 class Study:
-    """Simulate once, or once for every combination of some values.
-
-    scan: places in the data group, such as `operating_point.voltage`, and their values; None for
-    one run. labels: names of the places in tables and figures; by default their own.
-    Raises ValueError for a place that does not exist in the data group.
-    """
+    """Simulate once; Hydra's multirun does so for every combination of some settings."""
 
     data: Deferred
-    scan: Scan
-    parallel: Workers
     figures: Windowed
-    labels: Mapping[str, str]
-
-    def __post_init__(self) -> None:
-        scan_points(self.data, self.scan or {})  # refuses a misspelt place before any simulation
 
     def run(self, report: Report) -> None:
-        if self.scan:
-            self._scan(report, self.scan)
-        else:
-            self._simulate(report)
-
-    def _simulate(self, report: Report) -> None:
         field = self.data.build()
         check_simulation(field, self.data)
         write(field, report.folder.file("field.nc"))
@@ -165,15 +151,14 @@ class Study:
         report.figure("maps", draw, CAPTIONS["maps"] + radial)
         report.samples("profiles", breathing.profile_table(field))
 
-    def _scan(self, report: Report, scan: Mapping[str, Sequence[Any]]) -> None:
-        points = scan_points(self.data, scan)
-        with report.progress(None, "", "kernels, compiled once"):
-            compile_kernels([point.data for point in points])
-        stage = report.progress(len(points), "simulation")
-        results: list[Simulated] = collect(self.parallel, run_point, points, stage)
-        if all(result["status"] == FAILED for result in results):
-            raise ValueError(f"a scan needs a point that can be run: {results[0]['message']}")
-        add_scan(report, points, results, self.labels)
+
+def check_simulation(field: object, data: Deferred) -> None:
+    """Raise ValueError unless the data group names a simulation of this package."""
+    if not (isinstance(field, xr.Dataset) and is_simulation(field.attrs)):
+        raise ValueError(
+            "data must be a simulation, with status, current and parameters as its attributes: "
+            f"{data.settings['_target_']} gave none; choose data=simulation"
+        )
 
 
 def performance(field: xr.Dataset) -> dict[str, Any]:

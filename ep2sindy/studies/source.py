@@ -282,10 +282,9 @@ def split_in_time(run: Trajectory, held_out: float) -> tuple[Trajectory, Traject
     return run.window(0, n_train), run.window(n_train, run.n_samples)
 
 
-# Checks and messages for simulations used as data, and compilation of their kernels.
+# Checks and messages for simulations used as data.
 
 MIN_SAMPLES = 200  # some breathing periods at the usual step; fewer cannot be assessed
-GLIMPSE_SAMPLES = 20
 BALANCE_TOLERANCE = 1e-3  # relative to the inflow; a float32 record closes to 1e-4
 BALANCES = {"mass_balance": "mass", "energy_balance": "energy"}
 VERDICTS = {
@@ -369,15 +368,3 @@ def quiet(data: Deferred) -> Deferred:
         return data.changed({"progress": False})
     except ValueError:
         return data  # these data show no progress
-
-
-def compile_kernels(data: Sequence[Deferred]) -> None:
-    """Run a few samples in this process, so that workers find the compiled kernels on disk."""
-    for each in data:
-        sample_s = each.settings.get("sample_s") or 1e-6
-        brief = {"duration_s": GLIMPSE_SAMPLES * sample_s, "warm_up_s": 0.0, "cache": None}
-        try:
-            each.changed({"sample_s": sample_s, **brief}).build()
-        except ValueError:
-            continue  # the point reports the reason when it is run
-        return

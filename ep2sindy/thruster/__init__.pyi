@@ -6,8 +6,6 @@ from ep2sindy.thruster.parameters import Background as Background  # for configs
 from ep2sindy.thruster.parameters import NeutralSpeed as NeutralSpeed  # for configs
 from ep2sindy.thruster.parameters import Circuit as Circuit  # for configs
 from ep2sindy.thruster.parameters import ModulatedVoltage as ModulatedVoltage  # for configs
-from ep2sindy.thruster.parameters import VoltageTable as VoltageTable  # for configs
-from ep2sindy.thruster.parameters import read_voltage as read_voltage  # for configs
 from ep2sindy.thruster.axial.simulate import simulate as simulate  # for configs
 from ep2sindy.thruster.axial.starts import ColdStart as ColdStart  # for configs
 from ep2sindy.thruster.axial.starts import GuessedStart as GuessedStart  # for configs

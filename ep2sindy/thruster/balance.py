@@ -22,22 +22,46 @@ Terms = dict[str, np.ndarray]
 def zone_balance(
     field: xr.Dataset, zone: Zone | tuple[float, float], *, axisymmetric: bool = True
 ) -> xr.Dataset:
-    """Terms of d<n>/dt, the changes of the zone averages of n_i and n_n; in m^-3/s, by time.
+    """Terms of the balances of the zone averages of n_i and n_n, over time.
 
-    zone: a `Zone` without r, or (from, to) in m. Returned, as far as the field gives them:
-    change_i, change_n: of the averages. ionization: neutrals that become ions. exit_i, exit_n: what
-    leaves through the end away from the anode, less what enters through the other end if this is
-    not the anode. returned: ions that become neutrals at the walls and, in a zone that begins at
-    the first grid point, at the anode. supply: neutrals that then enter there.
+    A run of `simulate` with averages gives all terms exactly, for ions of all charges together.
+    Other fields, with r or without, give ionization by n_i n_n R_ion, exit_i by n_i u_iz in the
+    zone's last cells, and supply by the attribute `neutral_inflow` (m^-2/s) of the (z, r)
+    simulator; `returned` and exit_n are then what is missing for the balance to close.
 
-    A run of `simulate` with averages gives them all exactly, for ions of all charges together, and
-    besides inflow_i and inflow_n (net, through both ends), wall_loss, and residual, which is zero
-    but for rounding: the change of ions and neutrals less their inflow. Other fields, with r or
-    without, give ionization by n_i n_n R_ion, exit_i by n_i u_iz in the zone's last cells, supply
-    by the attribute `neutral_inflow` (m^-2/s) of the (z, r) simulator; `returned` and exit_n are
-    then what is missing for the balance to close.
-    Raises ValueError for a field without both densities, a zone without cells, or one of a
-    simulation that holds the last cell.
+    Parameters
+    ----------
+    field : Dataset
+        A simulation or a measured field.
+    zone : Zone or (float, float)
+        A `Zone` without r, or (from, to) in z in m.
+    axisymmetric : bool, default True
+        True if r is the radius of a cylinder.
+
+    Returns
+    -------
+    Dataset
+        As far as the field gives them, in m^-3/s: `change_i` and `change_n`, the changes of the
+        averages; `ionization`, neutrals that become ions; `exit_i` and `exit_n`, what leaves
+        through the end away from the anode, less what enters through the other end if this is not
+        the anode; `returned`, ions that become neutrals at the walls and, in a zone that begins at
+        the first grid point, at the anode; `supply`, neutrals that then enter there. For a run of
+        `simulate` with averages also `inflow_i` and `inflow_n` (net, through both ends),
+        `wall_loss`, and `residual`, the change of ions and neutrals less their inflow, which is
+        zero but for rounding.
+
+    Raises
+    ------
+    ValueError
+        If the field lacks a density, the zone has no cells, or it holds the last cell of a
+        simulation.
+
+    Notes
+    -----
+    The balances are
+
+        d<n_i>/dt = ionization - exit_i - returned
+        d<n_n>/dt = supply - ionization - exit_n + returned
     """
     if missing := [name for name in DENSITIES if name not in field]:
         raise ValueError(

@@ -19,11 +19,27 @@ def ionization_rate(
 ) -> xr.Dataset:
     """Add R_ion in m^3/s, the ionization rate coefficient of a gas, computed from T_e_eV.
 
-    gas: xenon, from the fits of `ep2sindy.thruster.propellants`; krypton or argon, from the tables
-    of `ep2sindy.thruster.propellant`, linear between their rows. table: CSV file of T_e in eV
-    (increasing) and rate in m^3/s of any gas, used instead of `gas`, linear between its rows;
-    further columns and lines of text are ignored. Raises ValueError if the field has R_ion already
-    or no T_e_eV, or if T_e_eV leaves a table; tables are never extrapolated.
+    Parameters
+    ----------
+    field : Dataset
+        Field with T_e_eV.
+    gas : str, default 'xenon'
+        "xenon", from the fits of `ep2sindy.thruster.propellants`; "krypton" or "argon", from the
+        tables of `propellant`, linear between their rows.
+    table : str or Path, optional
+        CSV file of T_e in eV (increasing) and rate in m^3/s of any gas, used instead of `gas`,
+        linear between its rows. Further columns and lines of text are ignored.
+
+    Returns
+    -------
+    Dataset
+        The field with R_ion.
+
+    Raises
+    ------
+    ValueError
+        If the field has R_ion already or no T_e_eV, or T_e_eV leaves a table. Tables are never
+        extrapolated.
     """
     if "R_ion" in field:
         raise ValueError(

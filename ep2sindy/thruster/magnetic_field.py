@@ -26,7 +26,22 @@ HIGHEST_T = 1.0  # above any Hall thruster: a larger number is in another unit
 
 @dataclass(frozen=True)
 class MagneticField:
-    """A Gaussian field with its peak at the exit, wider in the plume."""
+    """A Gaussian field with its peak at the exit, wider in the plume.
+
+    Parameters
+    ----------
+    peak : float, default 0.015
+        Field at the exit in T.
+    width_channel : float, default 0.011
+        Standard deviation in the channel in m.
+    width_plume : float, default 0.018
+        Standard deviation in the plume in m.
+
+    Raises
+    ------
+    ValueError
+        If a number is not positive.
+    """
 
     peak: float = 15e-3  # T
     width_channel: float = 11e-3  # m, standard deviation
@@ -48,8 +63,19 @@ class MagneticField:
 class MagneticFieldTable:
     """Field interpolated by a shape-preserving cubic (PCHIP), which does not overshoot.
 
-    distance: from the exit in m, increasing, negative inside. B: in T; its sign is ignored.
     The table may end up to its widest step short of the domain; the end value is held there.
+
+    Parameters
+    ----------
+    distance : sequence of float
+        Distances from the exit in m, increasing, negative inside.
+    B : sequence of float
+        Field in T. Its sign is ignored.
+
+    Raises
+    ------
+    ValueError
+        If there are gaps, points out of order, or the field is zero everywhere or too large for T.
     """
 
     distance: Points
@@ -92,11 +118,32 @@ def read_magnetic_field(
 ) -> MagneticFieldTable:
     """Read a field from a CSV file of two columns, position and field.
 
-    exit_m: position of the channel's exit in m on the file's own axis (0.025 if the axis begins at
-    the anode of a channel of 25 mm, 0 if it begins at the exit). Units (m, cm, mm; T, mT, G) stand
-    in the header, as in `z_mm,B_mT` or `z (cm), Br [G]`, or are given. A file without units is
-    taken as m and T, if its numbers are plausible. scale: factor on the field. Lines that begin
-    with # are ignored. Raises ValueError for a gap, an unknown unit, or a field above 1 T.
+    Lines that begin with # are ignored.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+    exit_m : float
+        Position of the channel's exit in m on the file's own axis: 0.025 if the axis begins at the
+        anode of a channel of 25 mm, 0 if it begins at the exit.
+    z_unit : str, optional
+        Unit of the positions: m, cm or mm. None reads it in the header, as in `z_mm,B_mT` or
+        `z (cm), Br [G]`; a file without units is taken as m, if its numbers are plausible.
+    B_unit : str, optional
+        Unit of the field: T, mT or G. None reads it in the header, and without one takes T.
+    scale : float, default 1.0
+        Factor on the field.
+
+    Returns
+    -------
+    MagneticFieldTable
+        The field along the axis.
+
+    Raises
+    ------
+    ValueError
+        If there is a gap, a unit is unknown, or the field exceeds 1 T.
     """
     header, (z, B) = read_columns(Path(path), "file of a magnetic field", 2)
     z_name, B_name = header or ("", "")

@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.data.readers.source import file_named
 from ep2sindy.thruster.checks import check_not_negative, check_positive, set_profile
 from ep2sindy.thruster.constants import K_BOLTZMANN
 from ep2sindy.thruster.magnetic_field import Field, MagneticField
 from ep2sindy.thruster.plume import Plume
 from ep2sindy.thruster.propellants import Propellant, XenonFits, gas_name
-from ep2sindy.thruster.tables import read_columns
 from ep2sindy.thruster.transport import (
     AnomalousTransport,
     FunctionTransport,
@@ -30,13 +27,27 @@ Volts = Float[np.ndarray, " times"]
 
 @dataclass(frozen=True)
 class Circuit:
-    """Inductance in H behind the series resistance; capacitance in F across the discharge.
+    """Inductance behind the series resistance, and capacitance across the discharge.
+
+    Parameters
+    ----------
+    inductance : float, default 0.0
+        Inductance in H.
+    capacitance : float, default 0.0
+        Capacitance in F.
+
+    Raises
+    ------
+    ValueError
+        If both are zero, or either is negative.
+
+    Notes
+    -----
+    The circuit is
 
         supply -- series resistance -- inductance --+-- anode
                                                capacitance
                                            cathode --+
-
-    Raises ValueError if both are zero, or either is negative.
     """
 
     inductance: float = 0.0
@@ -53,11 +64,23 @@ class Circuit:
 
 @dataclass(frozen=True)
 class ModulatedVoltage:
-    """The operating point's voltage V_0, modulated: V_0 (1 + fraction sin(2 pi frequency t)).
+    """The operating point's voltage with a sinusoidal modulation during the record.
 
-    fraction: amplitude relative to V_0, above 0 and below 1. The modulation begins at t = 0, where
-    the record does. Raises ValueError for a fraction out of range or a frequency that is not
-    positive.
+    Parameters
+    ----------
+    fraction : float
+        Amplitude relative to the voltage, above 0 and below 1.
+    frequency_Hz : float
+        Frequency in Hz.
+
+    Raises
+    ------
+    ValueError
+        If the fraction is out of range, or the frequency is not positive.
+
+    Notes
+    -----
+    The voltage is V_0 (1 + fraction sin(2 pi frequency_Hz t)), with t = 0 where the record begins.
     """
 
     fraction: float
@@ -72,9 +95,6 @@ class ModulatedVoltage:
                 "; 0.05 is five per cent"
             )
 
-    def check(self, voltage: float, end_s: float) -> None:
-        """Nothing: it continues for ever, about any voltage."""
-
     def at(self, t: Volts, voltage: float) -> Volts:
         """Voltage in V at times in s, constant before t = 0."""
         phase = 2.0 * np.pi * self.frequency_Hz * np.maximum(t, 0.0)
@@ -82,66 +102,31 @@ class ModulatedVoltage:
 
 
 @dataclass(frozen=True)
-class VoltageTable:
-    """Voltage of the supply in V at increasing times in s, linear between them.
-
-    t = 0 is where the record begins; before, during the warm-up, the voltage is that of t = 0,
-    which must be the operating point's. Raises ValueError for gaps, times that do not increase, a
-    first time above 0, or a voltage that is not positive.
-    """
-
-    time: tuple[float, ...]
-    voltage: tuple[float, ...]
-
-    def __post_init__(self) -> None:
-        set_profile(self, "time", "voltage", "V")
-        if self.time[0] > 0.0:
-            raise ValueError(
-                f"VoltageTable.time must begin at 0, where the record does, or before: it begins "
-                f"at {self.time[0]:g} s"
-            )
-
-    def check(self, voltage: float, end_s: float) -> None:
-        """Raise ValueError for another voltage at t = 0, or a table that ends before the run."""
-        first = float(self.at(np.zeros(1), voltage)[0])
-        if abs(first - voltage) > 1e-6 * voltage:
-            raise ValueError(
-                f"the operating point's voltage must be the supply's at t = 0: it is {voltage:g} V,"
-                f" and the table has {first:g} V; the warm-up is run at it"
-            )
-        if self.time[-1] < end_s:
-            raise ValueError(
-                f"the supply's voltage must be known to the end of the run, {end_s:g} s: the table "
-                f"ends at {self.time[-1]:g} s; lengthen it, or shorten duration_s"
-            )
-
-    def at(self, t: Volts, voltage: float) -> Volts:
-        """Voltage in V at times in s, constant before t = 0."""
-        return np.interp(np.maximum(t, 0.0), self.time, self.voltage)
-
-
-Supply = ModulatedVoltage | VoltageTable
-
-
-def read_voltage(path: str | Path) -> VoltageTable:
-    """Read a VoltageTable from a CSV file of two columns, time in s and voltage in V.
-
-    A first row without numbers is a header; lines that begin with # are ignored. Raises ValueError
-    for a gap, or as VoltageTable does.
-    """
-    _, columns = read_columns(Path(path), "file of a voltage", 2)
-    with file_named(Path(path)):
-        return VoltageTable(*columns)
-
-
-@dataclass(frozen=True)
 class Background:
     """The facility's residual gas, of the same kind as the propellant.
 
-    The channel takes in ingestion p/(k_B T) sqrt(8 k_B T/(pi m))/4 per area, the flux of a gas at
-    rest, next to the anode's flow. pressure_Pa: 1e-5 Torr are 1.33e-3 Pa. ingestion: factor on that
-    flux, as gas enters from the plume, too. A `PressureShift` follows the pressure.
-    Raises ValueError for a pressure or ingestion below 0, or a temperature that is not positive.
+    A `PressureShift` of the transport follows the pressure.
+
+    Parameters
+    ----------
+    pressure_Pa : float
+        Pressure in Pa. 1e-5 Torr are 1.33e-3 Pa.
+    temperature_K : float, default 300.0
+        Temperature in K.
+    ingestion : float, default 1.0
+        Factor on the flux of a gas at rest, as gas enters from the plume, too.
+
+    Raises
+    ------
+    ValueError
+        If the pressure or the ingestion is negative, or the temperature is not positive.
+
+    Notes
+    -----
+    Besides the anode's flow, the channel takes in per area, with the gas pressure p and temperature
+    T,
+
+        ingestion p / (k_B T) sqrt(8 k_B T / (pi m)) / 4
     """
 
     pressure_Pa: float
@@ -161,11 +146,21 @@ class Background:
 
 @dataclass(frozen=True)
 class NeutralSpeed:
-    """Axial speed of the neutrals in m/s at increasing distances from the exit in m.
+    """Axial speed of the neutrals as a profile, linear between points, constant beyond their ends.
 
-    Linear between the points, constant beyond their ends; distances are negative in the channel.
-    Slow neutrals are ionised first, so that the mean speed grows along the channel.
-    Raises ValueError for gaps, points out of order, or a speed that is not positive.
+    Slow neutrals are ionized first, so that the mean speed grows along the channel.
+
+    Parameters
+    ----------
+    distance : sequence of float
+        Distances from the exit in m, increasing, negative in the channel.
+    speed : sequence of float
+        Speeds in m/s.
+
+    Raises
+    ------
+    ValueError
+        If there are gaps, points out of order, or a speed that is not positive.
     """
 
     distance: Points
@@ -189,14 +184,66 @@ def _tuned_wall() -> SheathWall:
 class Thruster:
     """Geometry, field, closures and boundary values of one thruster; the default is SPT-100-like.
 
-    kappa = conduction_factor/(1 + conduction_coulomb nu_ei/nu) mu n T_e; 4.66 and 0 are
-    Braginskii's values for singly charged ions. Transport, wall, resistance and conduction are
-    tuned (docs/thruster.md). charge_states: highest charge of the ions,
-    1 to 3; None takes 2 where the gas has the rates, else 1.
-    cathode_potential: potential of the cathode plane relative to the cathode (coupling voltage).
-    ions_born_at_rest: if True, ionisation adds no momentum to the ions, as in LANDMARK; otherwise
-    it adds the neutrals' momentum. plume: how the plasma spreads beyond the exit; None keeps
-    the channel's cross-section.
+    Transport, wall, resistance and conduction are tuned (docs/thruster.md).
+
+    Parameters
+    ----------
+    channel_length : float, default 0.025
+        Length of the channel in m.
+    domain_length : float, default 0.05
+        Length of the domain from the anode to the cathode plane in m.
+    inner_radius : float, default 0.035
+        Inner radius of the channel in m.
+    outer_radius : float, default 0.05
+        Outer radius of the channel in m.
+    magnetic_field : MagneticField or MagneticFieldTable, default MagneticField()
+        Radial magnetic field along the axis.
+    transport : Transport, default AnomalousTransport()
+        Anomalous collisions of the electrons, such as `AnomalousTransport`.
+    propellant : Propellant, default XenonFits()
+        Rates of the gas, such as `XenonFits()` or `propellant("krypton")`.
+    charge_states : int, optional
+        Highest charge of the ions, 1 to 3. None takes 2 where the gas has the rates, else 1.
+    wall : Wall, default _tuned_wall()
+        Losses to the channel's walls, such as `SheathWall`.
+    ion_temperature : float, default 1000.0
+        Temperature of the ions in K.
+    anode : AnodeSheath or FixedAnode, default FixedAnode()
+        Boundary condition at the anode.
+    cathode_T_e_eV : float, default 3.0
+        Electron temperature at the cathode plane in eV.
+    cathode_potential : float, default 20.0
+        Potential of the cathode plane relative to the cathode (coupling voltage) in V.
+    series_resistance : float, default 0.8
+        Resistance between the supply and the anode in ohm.
+    circuit : Circuit, optional
+        Inductance and capacitance of the circuit, in addition to the series resistance.
+    pressure_factor : float, default 1.0
+        Factor in the electron pressure p_e = pressure_factor n T_e.
+    conduction_factor : float, default 7.5
+        Factor in the heat conduction, see Notes.
+    conduction_coulomb : float, default 0.0
+        Weight of Coulomb collisions in the heat conduction, see Notes.
+    ions_born_at_rest : bool, default False
+        True if ionization adds no momentum to the ions, as in LANDMARK. False adds the momentum of
+        the neutrals.
+    plume : Plume, optional
+        How the plasma spreads beyond the exit. None keeps the channel's cross-section.
+
+    Raises
+    ------
+    ValueError
+        If a length or factor has the wrong sign, the channel is longer than the domain, the radii
+        are out of order, the circuit has no resistance, or the magnetic field does not cover the
+        domain.
+
+    Notes
+    -----
+    The heat conduction is
+
+        kappa = conduction_factor / (1 + conduction_coulomb nu_ei / nu) mu n T_e
+
+    where 4.66 and 0 are Braginskii's values for singly charged ions.
     """
 
     channel_length: float = 0.025  # m
@@ -304,16 +351,31 @@ class Thruster:
 
 @dataclass(frozen=True)
 class OperatingPoint:
-    """The operator's settings: supply voltage in V, anode flow in mg/s; and the neutrals' speed.
+    """What the operator sets, supply voltage and anode flow, and the speed of the neutrals.
 
-    supply: how the voltage varies in time; None keeps it constant. neutral_speed: in m/s, or along
-    the axis as a `NeutralSpeed`. background: the facility's gas; None is a perfect vacuum.
+    Parameters
+    ----------
+    voltage : float
+        Voltage of the supply in V.
+    mass_flow_mg_s : float
+        Anode flow in mg/s.
+    neutral_speed : float or NeutralSpeed, default 338.0
+        Speed of the neutrals in m/s, or its profile along the axis.
+    supply : ModulatedVoltage, optional
+        How the voltage varies in time. None means that it is constant.
+    background : Background, optional
+        The gas of the facility. None is a perfect vacuum.
+
+    Raises
+    ------
+    ValueError
+        If a number is not positive.
     """
 
     voltage: float  # V
     mass_flow_mg_s: float
     neutral_speed: float | NeutralSpeed = 338.0  # m/s, tuned
-    supply: Supply | None = None
+    supply: ModulatedVoltage | None = None
     background: Background | None = None
 
     def __post_init__(self) -> None:

@@ -24,11 +24,20 @@ Profile = Float[np.ndarray, " z"]
 class ConicalPlume:
     """A plume of one half-angle.
 
-    half_angle_deg: 0 to 45. axial_thrust: if True, thrust is the axial part of the ions' momentum,
-    cos(angle) A sum(m n u^2) at the cathode plane; if False, all of it. True is right where the
-    ions' speed stands for the whole drop of the potential, as in every 1-D model; HallThruster.jl
-    (apply_thrust_divergence_correction) has the same factor and takes False unless set.
-    Raises ValueError for an angle out of range.
+    Parameters
+    ----------
+    half_angle_deg : float
+        Half-angle in degrees, 0 to 45.
+    axial_thrust : bool, default True
+        True counts only the axial part of the ions' momentum as thrust, cos(angle) A sum(m n u^2)
+        at the cathode plane; False counts all of it. True is right where the ions' speed stands for
+        the whole drop of the potential, as in every 1-D model. HallThruster.jl
+        (apply_thrust_divergence_correction) has the same factor and takes False unless set.
+
+    Raises
+    ------
+    ValueError
+        If the angle is out of range.
     """
 
     half_angle_deg: float
@@ -50,9 +59,20 @@ class ConicalPlume:
 class ThermalPlume:
     """A plume that spreads by the ions' sound speed at the exit over their speed at each place.
 
-    The tangent is sqrt(5 e T_e/(3 m)) / u_i with T_e at the exit, at most 1; slower ions and those
-    that move back spread by 45 degrees. u_i is the mean over the charges, weighted by density.
-    axial_thrust: as for `ConicalPlume`, with the half-angle at the cathode plane.
+    Parameters
+    ----------
+    axial_thrust : bool, default True
+        As for `ConicalPlume`, with the half-angle at the cathode plane.
+
+    Notes
+    -----
+    The tangent of the half-angle is
+
+        min(1, sqrt(5 e T_e / (3 m)) / u_i)
+
+    with T_e at the exit. Slower ions and those that move back spread by 45 degrees. u_i is the mean
+    over the charges, weighted by density.
+
     Source: the plume of HallThruster.jl, Marks et al., JOSS 8 (2023) 4672; its older versions hold
     the tangent at pi/4 or not at all.
     """

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,26 +11,29 @@ import numpy as np
 
 from ep2sindy.data.readers.source import file_named
 from ep2sindy.thruster.constants import ATOMIC_MASS, M_ARGON, M_KRYPTON, M_XENON
-from ep2sindy.thruster.propellants import FURTHER_IONIZATIONS, PropellantTable
+from ep2sindy.thruster.propellants import FURTHER_IONIZATIONS, FurtherIonization, PropellantTable
 from ep2sindy.thruster.tables import read_columns
 
 GASES = Path(__file__).parent / "gases"
 RATES = ("ionization", "excitation", "momentum")
 # Energies in eV: HallThruster.jl's tables, whose lumped levels they are; argon: its cross sections
-ENERGIES: dict[str, dict[str, float]] = {
+FIRST: dict[str, dict[str, float]] = {
+    "xenon": {"ionization_eV": 12.1298437, "excitation_eV": 8.32},
+    "krypton": {"ionization_eV": 13.9996055, "excitation_eV": 9.99},
+    "argon": {"ionization_eV": 15.8, "excitation_eV": 11.5},
+}
+HIGHER: dict[str, dict[str, float]] = {
     "xenon": {
-        "ionization_eV": 12.1298437, "excitation_eV": 8.32,
-        "double_ionization_eV": 33.1048437, "second_ionization_eV": 20.975,
-        "triple_ionization_eV": 64.1548427, "ion_double_ionization_eV": 52.025,
-        "third_ionization_eV": 31.05,
+        "double_ionization": 33.1048437, "second_ionization": 20.975,
+        "triple_ionization": 64.1548427, "ion_double_ionization": 52.025,
+        "third_ionization": 31.05,
     },
     "krypton": {
-        "ionization_eV": 13.9996055, "excitation_eV": 9.99,
-        "double_ionization_eV": 38.3594455, "second_ionization_eV": 24.35984,
-        "triple_ionization_eV": 74.2174455, "ion_double_ionization_eV": 60.21784,
-        "third_ionization_eV": 35.838,
+        "double_ionization": 38.3594455, "second_ionization": 24.35984,
+        "triple_ionization": 74.2174455, "ion_double_ionization": 60.21784,
+        "third_ionization": 35.838,
     },
-    "argon": {"ionization_eV": 15.8, "excitation_eV": 11.5},
+    "argon": {},
 }  # fmt: skip
 MASSES = {"xenon": M_XENON, "krypton": M_KRYPTON, "argon": M_ARGON}
 
@@ -37,10 +41,29 @@ MASSES = {"xenon": M_XENON, "krypton": M_KRYPTON, "argon": M_ARGON}
 def propellant(name: str, *, coulomb_weight: float = 1.0) -> PropellantTable:
     """A gas that comes with the package: xenon, krypton, argon, or xenon_5eV.
 
-    Xenon and krypton are the tables of HallThruster.jl, for T_e up to 170 and 100 eV, with ions
-    of up to three charges. Argon is computed from the cross sections of Phelps & Petrovic (1999),
-    up to 100 eV. Each file in `gases/` names its sources. xenon_5eV has the ionisation table of the
-    stored runs of HallThruster.jl v0.22, linear over 5 eV. The default `XenonFits` are formulas.
+    Parameters
+    ----------
+    name : str
+        Name of the gas.
+    coulomb_weight : float, default 1.0
+        Factor on the frequency of Coulomb collisions.
+
+    Returns
+    -------
+    PropellantTable
+        Tables of its rates, linear between their rows.
+
+    Raises
+    ------
+    ValueError
+        If the gas is unknown.
+
+    Notes
+    -----
+    Xenon and krypton are the tables of HallThruster.jl, for T_e up to 170 and 100 eV, with ions of
+    up to three charges. Argon is computed from the cross sections of Phelps & Petrovic (1999), up
+    to 100 eV. xenon_5eV has the ionization table of the stored runs of HallThruster.jl v0.22,
+    linear over 5 eV. Each file in `gases/` names its sources. The default `XenonFits` are formulas.
     """
     if name == "xenon_5eV":
         return _resample_ionization(propellant("xenon", coulomb_weight=coulomb_weight), name)
@@ -50,22 +73,29 @@ def propellant(name: str, *, coulomb_weight: float = 1.0) -> PropellantTable:
             "of your own is read by ep2sindy.thruster.read_propellant"
         )
     return _table(
-        GASES / f"{name}.csv", name, MASSES[name], ENERGIES[name], coulomb_weight=coulomb_weight
-    )
+        GASES / f"{name}.csv", name, MASSES[name], FIRST[name], HIGHER[name],
+        coulomb_weight=coulomb_weight,
+    )  # fmt: skip
 
 
 def _resample_ionization(xenon: PropellantTable, name: str) -> PropellantTable:
     """Xenon with the ionisation table of 5 eV steps, resampled at 1 eV of mean energy."""
     stored = _columns(GASES / "xenon_ionization_5eV.csv")
     energy = np.arange(1.0 + np.floor(stored["mean_energy_eV"][-1]))
-    rates: dict[str, Any] = {
-        f"{rate}_rate": tuple(np.interp(energy / 1.5, xenon.T_e_eV, getattr(xenon, f"{rate}_rate")))
-        for rate in (*RATES, *FURTHER_IONIZATIONS.values())
-    }
-    rates["ionization_rate"] = tuple(
-        np.interp(energy, stored["mean_energy_eV"], stored["ionization"])
+    T_e_eV = energy / 1.5
+
+    def resampled(rate: tuple[float, ...]) -> tuple[float, ...]:
+        return tuple(np.interp(T_e_eV, xenon.T_e_eV, rate))
+
+    return replace(
+        xenon,
+        name=name,
+        T_e_eV=tuple(T_e_eV),
+        ionization_rate=tuple(np.interp(energy, stored["mean_energy_eV"], stored["ionization"])),
+        excitation_rate=resampled(xenon.excitation_rate),
+        momentum_rate=resampled(xenon.momentum_rate),
+        further=tuple(replace(each, rate=resampled(each.rate)) for each in xenon.further),
     )
-    return replace(xenon, name=name, T_e_eV=tuple(energy / 1.5), **rates)
 
 
 def read_propellant(
@@ -74,37 +104,50 @@ def read_propellant(
     mass_u: float,
     ionization_eV: float,
     excitation_eV: float,
-    double_ionization_eV: float | None = None,
-    second_ionization_eV: float | None = None,
-    triple_ionization_eV: float | None = None,
-    ion_double_ionization_eV: float | None = None,
-    third_ionization_eV: float | None = None,
+    further_eV: Mapping[str, float] | None = None,
     name: str | None = None,
 ) -> PropellantTable:
-    """Read a user's gas from a CSV file whose header names the columns.
+    """Read a gas of your own from a CSV file whose header names the columns.
 
-    Columns: T_e_eV or mean_energy_eV (which is 1.5 T_e), increasing; ionization, excitation and
-    momentum, rate coefficients in m^3/s; for a second charge double_ionization (X -> X2+) and
-    second_ionization (X+ -> X2+), for a third triple_ionization (X -> X3+), ion_double_ionization
-    (X+ -> X3+) and third_ionization (X2+ -> X3+). Lines that begin with # are ignored. mass_u: mass
-    of the atom in atomic mass units. The energies are an electron's loss per event, in eV.
-    Raises ValueError for a missing file, a missing or unknown column, or a gap.
+    Parameters
+    ----------
+    path : str or Path
+        The file. Its columns are T_e_eV or mean_energy_eV (which is 1.5 T_e), increasing;
+        ionization, excitation and momentum, rate coefficients in m^3/s; for a second charge
+        double_ionization (X -> X2+) and second_ionization (X+ -> X2+); for a third
+        triple_ionization (X -> X3+), ion_double_ionization (X+ -> X3+) and third_ionization (X2+ ->
+        X3+). Lines that begin with # are ignored.
+    mass_u : float
+        Mass of the atom in atomic mass units.
+    ionization_eV, excitation_eV : float
+        Energy that an electron loses per event, in eV.
+    further_eV : Mapping, optional
+        The same for higher charges, by column of the file: `{"double_ionization": 33.1, ...}`.
+    name : str, optional
+        Name of the gas. None takes that of the file.
+
+    Returns
+    -------
+    PropellantTable
+        Tables of its rates, linear between their rows.
+
+    Raises
+    ------
+    ValueError
+        If the file or a column is missing, a column is unknown, or there is a gap.
     """
-    given = {
-        "ionization_eV": ionization_eV,
-        "excitation_eV": excitation_eV,
-        "double_ionization_eV": double_ionization_eV,
-        "second_ionization_eV": second_ionization_eV,
-        "triple_ionization_eV": triple_ionization_eV,
-        "ion_double_ionization_eV": ion_double_ionization_eV,
-        "third_ionization_eV": third_ionization_eV,
-    }
-    energies = {key: value for key, value in given.items() if value is not None}
-    return _table(Path(path), name or Path(path).stem, mass_u * ATOMIC_MASS, energies)
+    first = {"ionization_eV": ionization_eV, "excitation_eV": excitation_eV}
+    path = Path(path)
+    return _table(path, name or path.stem, mass_u * ATOMIC_MASS, first, further_eV or {})
 
 
 def _table(
-    path: Path, name: str, mass: float, energies: dict[str, float], coulomb_weight: float = 1.0
+    path: Path,
+    name: str,
+    mass: float,
+    first_eV: Mapping[str, float],
+    further_eV: Mapping[str, float],
+    coulomb_weight: float = 1.0,
 ) -> PropellantTable:
     columns = _columns(path)
     scale = {"T_e_eV": 1.0, "mean_energy_eV": 1.5}
@@ -115,13 +158,18 @@ def _table(
             f"{path} must have the columns T_e_eV or mean_energy_eV, {', '.join(RATES)}, and may "
             f"have {', '.join(FURTHER_IONIZATIONS.values())}: it has {list(columns)}"
         )
-    rates: dict[str, Any] = {
-        f"{key}_rate": columns[key]
-        for key in (*RATES, *FURTHER_IONIZATIONS.values())
-        if key in columns
-    }
+    rates: dict[str, Any] = {**first_eV} | {f"{key}_rate": columns[key] for key in RATES}
     rates["T_e_eV"] = tuple(value / scale[first[0]] for value in columns[first[0]])
-    rates |= energies
+    if {*further_eV} != {*columns} & {*FURTHER_IONIZATIONS.values()}:
+        raise ValueError(
+            f"every further ionisation of {path} needs both its column and its energy in "
+            f"further_eV: the columns are {list(columns)}, the energies of {list(further_eV)}"
+        )
+    rates["further"] = tuple(
+        FurtherIonization(*pair, rate=columns[key], energy_eV=further_eV[key])
+        for pair, key in FURTHER_IONIZATIONS.items()
+        if key in columns
+    )
     with file_named(path):
         return PropellantTable(name, mass, coulomb_weight=coulomb_weight, **rates)
 

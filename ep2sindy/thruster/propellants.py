@@ -85,12 +85,26 @@ def coulomb_rate(T_e_eV: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class XenonFits:
-    """Xenon coefficients as published formulas (Goebel & Katz, appendix E and chapter 3).
+    """Xenon coefficients as published formulas.
 
     Inelastic rates are evaluated at the electrons' total mean energy 1.5 T_e + K, where K is the
-    kinetic energy of their drift, that is at T_e + 2 K/3; with `drift_weight` 0, at T_e. The whole
-    energy of an event is taken from the heat: drag along the field becomes heat whatever its cause,
-    and the drift energy, which follows the field at once, is not stored.
+    kinetic energy of their drift, that is at T_e + 2 K/3. The whole energy of an event is taken
+    from the heat: drag along the field becomes heat whatever its cause, and the drift energy, which
+    follows the field at once, is not stored.
+
+    Parameters
+    ----------
+    drift_weight : float, default 1.0
+        Factor on K. With 0 the rates are evaluated at T_e.
+
+    Raises
+    ------
+    ValueError
+        If the weight is negative.
+
+    Notes
+    -----
+    Source: Goebel & Katz, appendix E and chapter 3.
     """
 
     drift_weight: float = 1.0
@@ -129,13 +143,40 @@ class XenonFits:
 
 
 @dataclass(frozen=True)
+class FurtherIonization:
+    """Ionisation from one charge to a higher one in a single event, beyond X -> X+.
+
+    rate: coefficients in m^3/s, at the temperatures of a `PropellantTable`. energy_eV: that an
+    electron loses.
+    """
+
+    charge: int
+    higher: int
+    rate: tuple[float, ...]
+    energy_eV: float
+
+    def check(self, T_e_eV: tuple[float, ...]) -> None:
+        """Raise ValueError for rates of other rows, negative ones, or no positive energy."""
+        check_positive(self, "energy_eV")
+        name = FURTHER_IONIZATIONS[self.charge, self.higher]
+        if len(self.rate) != len(T_e_eV):
+            raise ValueError(f"{name} must have {len(T_e_eV)} rows, got {len(self.rate)}")
+        check_rate(name, self.rate)
+
+
+def check_rate(name: str, rate: tuple[float, ...]) -> None:
+    """Raise ValueError for a negative coefficient, or one that is not finite."""
+    if not (np.isfinite(rate).all() and min(rate) >= 0.0):
+        raise ValueError(f"{name} must be zero or more in every row")
+
+
+@dataclass(frozen=True)
 class PropellantTable:
     """Any gas: rate coefficients in m^3/s over the electron temperature, linear between rows.
 
     T_e_eV: increasing. There are two kinds of inelastic events, ionisation and one lumped
-    excitation. With both columns of the second charge (double: X -> X2+, second: X+ -> X2+) and
-    their energies there are X2+; with the three of the third (triple: X -> X3+, ion_double: X+ ->
-    X3+, third: X2+ -> X3+) X3+ as well; a charge whose columns are not all there is refused.
+    excitation. further: with X -> X2+ and X+ -> X2+ there are X2+; with X -> X3+, X+ -> X3+ and
+    X2+ -> X3+ there are X3+ as well; a charge whose events are not all there is refused.
     coulomb_weight: 0 leaves electron-ion collisions out. drift_weight: as in `XenonFits`. Of the
     inelastic events, only excitation takes part of its energy from the drift, as in
     HallThruster.jl. Beyond the rows the end values are held, and a run that gets there reports it.
@@ -149,16 +190,7 @@ class PropellantTable:
     ionization_rate: tuple[float, ...]
     excitation_rate: tuple[float, ...]
     momentum_rate: tuple[float, ...]
-    double_ionization_rate: tuple[float, ...] = ()
-    second_ionization_rate: tuple[float, ...] = ()
-    double_ionization_eV: float | None = None
-    second_ionization_eV: float | None = None
-    triple_ionization_rate: tuple[float, ...] = ()
-    ion_double_ionization_rate: tuple[float, ...] = ()
-    third_ionization_rate: tuple[float, ...] = ()
-    triple_ionization_eV: float | None = None
-    ion_double_ionization_eV: float | None = None
-    third_ionization_eV: float | None = None
+    further: tuple[FurtherIonization, ...] = ()
     drift_weight: float = 1.0
     coulomb_weight: float = 1.0
 
@@ -166,39 +198,20 @@ class PropellantTable:
         check_positive(self, "mass", "ionization_eV", "excitation_eV")
         check_not_negative(self, "drift_weight", "coulomb_weight")
         check_increasing(self, "T_e_eV")
-        given = self._complete()
-        rates = [f"{n}_rate" for n in ("ionization", "excitation", "momentum", *given)]
+        rates = [f"{n}_rate" for n in ("ionization", "excitation", "momentum")]
         check_rows(self, "T_e_eV", *rates)
         for name in rates:
-            if min(getattr(self, name)) < 0.0:
-                raise ValueError(f"PropellantTable.{name} must be zero or more in every row")
-        if given:
-            check_positive(self, *(f"{name}_eV" for name in given))
-
-    def _complete(self) -> list[str]:
-        """Names of the further ionisations, once all of a charge and of those below are there."""
-        given = [name for name in FURTHER_IONIZATIONS.values() if self._has(name)]
-        for highest, word in ((2, "second"), (3, "third")):
-            needed = [
-                name for (_, higher), name in FURTHER_IONIZATIONS.items() if higher <= highest
-            ]
-            making = [
-                name for (_, higher), name in FURTHER_IONIZATIONS.items() if higher == highest
-            ]
-            if set(given) & set(making) and (lacking := [n for n in needed if n not in given]):
-                raise ValueError(
-                    f"a {word} charge needs {', '.join(needed)}, each with its energy: {self.name} "
-                    f"lacks {', '.join(lacking)}"
-                )
-        return given
-
-    def _has(self, name: str) -> bool:
-        rate, energy = getattr(self, f"{name}_rate"), getattr(self, f"{name}_eV")
-        if bool(rate) != (energy is not None):
+            check_rate(f"PropellantTable.{name}", getattr(self, name))
+        for each in self.further:
+            each.check(self.T_e_eV)
+        given = [(each.charge, each.higher) for each in self.further]
+        needed = [pair for pair in FURTHER_IONIZATIONS if pair[1] <= self.charge_states]
+        if sorted(given) != sorted(needed):
+            names = [FURTHER_IONIZATIONS[pair] for pair in needed]
             raise ValueError(
-                f"{name} of {self.name} needs both its column and {name}_eV, got only one"
+                f"ions of charge {self.charge_states} of {self.name} need {names}, each with its "
+                f"energy: got {given}"
             )
-        return bool(rate)
 
     @property
     def range_eV(self) -> tuple[float, float]:
@@ -208,7 +221,7 @@ class PropellantTable:
     @property
     def charge_states(self) -> int:
         """The highest charge that has rates: 1, 2 or 3."""
-        return 3 if self.third_ionization_rate else 2 if self.second_ionization_rate else 1
+        return max((each.higher for each in self.further), default=1)
 
     def _interpolate(self, T_e_eV: FloatArray, values: tuple[float, ...]) -> FloatArray:
         return np.interp(T_e_eV, self.T_e_eV, values)
@@ -247,21 +260,20 @@ class PropellantTable:
 
         charge, higher: a pair of `FURTHER_IONIZATIONS`. Raises ValueError for one without rates.
         """
-        return self._interpolate(T_e_eV, getattr(self, f"{self._further(charge, higher)}_rate"))
+        return self._interpolate(T_e_eV, self._further(charge, higher).rate)
 
     def further_energy(self, charge: int, higher: int) -> float:
         """Energy in eV that an electron loses in the event of `further_ionization`."""
-        return float(getattr(self, f"{self._further(charge, higher)}_eV"))
+        return self._further(charge, higher).energy_eV
 
-    def _further(self, charge: int, higher: int) -> str:
-        name = FURTHER_IONIZATIONS.get((charge, higher))
-        if name is None or higher > self.charge_states:
-            there = [pair for pair in FURTHER_IONIZATIONS if pair[1] <= self.charge_states]
+    def _further(self, charge: int, higher: int) -> FurtherIonization:
+        known = {(each.charge, each.higher): each for each in self.further}
+        if (charge, higher) not in known:
             raise ValueError(
-                f"{self.name} has further ionisations between the charges {there}, got "
+                f"{self.name} has further ionisations between the charges {[*known]}, got "
                 f"{(charge, higher)}; X -> X+ is `ionization`"
             )
-        return name
+        return known[charge, higher]
 
 
 Propellant = XenonFits | PropellantTable

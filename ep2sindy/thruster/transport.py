@@ -23,7 +23,22 @@ Points = Sequence[float] | Float[np.ndarray, " points"]
 
 @dataclass(frozen=True)
 class AnomalousTransport:
-    """Two zones, with c linear across a layer around the exit."""
+    """Anomalous transport of two zones, with c linear across a layer around the exit.
+
+    Parameters
+    ----------
+    c_channel : float, default 1 / 365
+        Coefficient in the channel.
+    c_plume : float, default 1 / 69
+        Coefficient in the plume.
+    transition : float, default 0.0035
+        Thickness of the layer in m.
+
+    Raises
+    ------
+    ValueError
+        If a coefficient is not positive, or the layer is negative.
+    """
 
     c_channel: float = 1 / 365
     c_plume: float = 1 / 69
@@ -40,11 +55,32 @@ class AnomalousTransport:
 
 @dataclass(frozen=True)
 class GaussianTransport:
-    """One level with a trough: c = c_far (1 - (1 - trough) exp(-((d - center)/width)^2 / 2)).
+    """Anomalous transport of one level, with a trough near the exit.
 
-    center: distance of the trough from the exit in m. width: its standard deviation in m.
-    trough: c at its middle, as a fraction of c_far. Source: GaussianBohm of HallThruster.jl,
-    Marks et al., JOSS 8 (2023) 4672.
+    Parameters
+    ----------
+    c_far : float, default 1 / 16
+        Coefficient far from the trough.
+    trough : float, default 0.1
+        Coefficient at the middle of the trough, as a fraction of c_far.
+    center : float, default 0.0
+        Distance of the trough from the exit in m.
+    width : float, default 0.005
+        Standard deviation of the trough in m.
+
+    Raises
+    ------
+    ValueError
+        If a coefficient or the width is not positive, the trough is above 1, or the center is not
+        finite.
+
+    Notes
+    -----
+    At the distance d from the exit,
+
+        c = c_far (1 - (1 - trough) exp(-((d - center) / width)^2 / 2))
+
+    Source: GaussianBohm of HallThruster.jl, Marks et al., JOSS 8 (2023) 4672.
     """
 
     c_far: float = 1 / 16
@@ -67,10 +103,23 @@ class GaussianTransport:
 
 @dataclass(frozen=True)
 class MultiLogTransport:
-    """Coefficients at given points: log c is linear between them, constant beyond the ends.
+    """Anomalous transport at given points: log c is linear between them, constant beyond the ends.
 
-    distance: of the points from the exit in m, increasing, negative inside. c: values at the
-    points. Hall2De and HallThruster.jl (MultiLogBohm) use the same form.
+    Parameters
+    ----------
+    distance : sequence of float
+        Distances of the points from the exit in m, increasing, negative inside.
+    c : sequence of float
+        Coefficients at the points.
+
+    Raises
+    ------
+    ValueError
+        If there are gaps, points out of order, or a coefficient that is not positive.
+
+    Notes
+    -----
+    Hall2De and HallThruster.jl (MultiLogBohm) use the same form.
     """
 
     distance: Points
@@ -89,13 +138,34 @@ BohmTransport = AnomalousTransport | GaussianTransport | MultiLogTransport
 
 @dataclass(frozen=True)
 class PressureShift:
-    """A transport that the facility's pressure p moves along the axis.
+    """A transport that the facility's pressure moves along the axis.
 
-    It stands at z* = z0 + dz/(1 + (alpha - 1)^(2 p/pressure_Pa - 1)), in channel lengths towards
-    the plume. With alpha above 2 and dz positive it moves from z0 + dz (1 - 1/alpha) in vacuum
-    towards the anode, by half of the way at half of pressure_Pa. The field B stays.
-    Raises ValueError for alpha at or below 1, a pressure that is not positive, or a shift that is
-    not finite. Source: LogisticPressureShift of HallThruster.jl, Marks et al., JOSS 8 (2023) 4672.
+    With alpha above 2 and dz positive it moves from z0 + dz (1 - 1/alpha) in vacuum towards the
+    anode, by half of that distance at half of pressure_Pa. The magnetic field stays.
+
+    Parameters
+    ----------
+    transport : BohmTransport
+        The transport that is moved.
+    z0, dz : float
+        Position and shift in channel lengths, towards the plume.
+    pressure_Pa : float
+        Scale of the pressure in Pa.
+    alpha : float
+        Steepness, above 1.
+
+    Raises
+    ------
+    ValueError
+        If alpha is not above 1, the pressure is not positive, or a shift is not finite.
+
+    Notes
+    -----
+    At the pressure p the transport stands at
+
+        z = z0 + dz / (1 + (alpha - 1)^(2 p / pressure_Pa - 1))
+
+    Source: LogisticPressureShift of HallThruster.jl, Marks et al., JOSS 8 (2023) 4672.
     """
 
     transport: BohmTransport
@@ -143,14 +213,27 @@ Coefficients = Callable[[Float[np.ndarray, " z"], float, Plasma], Any]
 
 @dataclass(frozen=True)
 class FunctionTransport:
-    """The coefficient as a function of your own: c(z, t, plasma), once for every sample.
+    """Anomalous transport by a function of your own, called once for every sample.
 
-    function: takes the distances from the exit in m, the time in s (negative in the warm-up) and a
-    `Plasma`, and gives c at each distance or one number. In a config it is the dotted name of a
-    function marked with `@ep.for_configs`, as `my_module.c`. Numbers that vary belong into a frozen
-    dataclass with `__call__`. At the very first call the field may be zero, for none is known yet.
-    identity: module, name and hash of the source, by which kept simulations are distinguished.
-    Raises ValueError for a function that is not there or not known by its source.
+    At the very first call the field may be zero, since none is known yet.
+
+    Parameters
+    ----------
+    function : callable or str
+        Takes the distances from the exit in m, the time in s (negative in the warm-up) and a
+        `Plasma`, and returns c at each distance or one number. In a config it is the dotted name of
+        a function marked with `@ep.for_configs`, such as `my_module.c`. Put numbers that vary into
+        a frozen dataclass with `__call__`.
+
+    Attributes
+    ----------
+    identity : str
+        Module, name and hash of the source, by which cached simulations are distinguished.
+
+    Raises
+    ------
+    ValueError
+        If the function is missing, or cannot be identified by its source.
     """
 
     function: Coefficients | str

@@ -52,15 +52,46 @@ class Wall(Protocol):
 class SheathWall:
     """Dielectric channel wall behind a sheath, with linear secondary-electron emission.
 
-    gamma = min(gamma_max, yield_0 + (1 - yield_0) 1.5 T_e / crossover_eV), where gamma_max = 1 -
-    8.3 sqrt(m_e/m) is the space-charge limit. Electrons collide with the wall at nu_w =
-    electron_scale 0.4965 sqrt(e T_e/m) / (gap (1 - gamma)). Each collision costs 2 T_e + (1 -
-    gamma) phi_w, phi_w = T_e ln((1 - gamma) sqrt(m / (2 pi m_e))). Beyond the exit, the fraction
-    `plume_collisions` of the collisions and the fraction `plume_power` of the power remain; ions
-    are lost in the channel only. transition: length in m over which the fractions change at the
-    exit. shielded_T_e_eV: temperature at the walls of a magnetically shielded thruster, whose field
-    lines bring the anode's cold electrons there; it replaces T_e in all losses. None: not shielded.
-    Default: BN-SiO2. Sources: Marks et al., JOSS 8 (2023) 4672; Goebel & Katz, chapter 7.
+    The default is BN-SiO2. Beyond the exit, ions are not lost.
+
+    Parameters
+    ----------
+    yield_0 : float, default 0.54
+        Emission at zero temperature, below 1.
+    crossover_eV : float, default 40.0
+        Energy at which one electron is emitted per electron, in eV.
+    electron_scale : float, default 0.9
+        Factor on the collisions of electrons with the wall.
+    ion_scale : float, default 0.5
+        Factor on the loss of ions.
+    plume_collisions : float, default 1.0
+        Fraction of the collisions that remains beyond the exit.
+    plume_power : float, default 1.0
+        Fraction of the power loss that remains beyond the exit.
+    transition : float, default 0.0
+        Length in m over which the fractions change at the exit.
+    shielded_T_e_eV : float, optional
+        Temperature at the walls of a magnetically shielded thruster, whose field lines bring the
+        anode's cold electrons there. It replaces T_e in all losses. None means that the thruster is
+        not shielded.
+
+    Raises
+    ------
+    ValueError
+        If a number has the wrong sign, or yield_0 is not below 1.
+
+    Notes
+    -----
+    With the electron temperature T_e in eV and the ion mass m,
+
+        gamma = min(1 - 8.3 sqrt(m_e / m), yield_0 + (1 - yield_0) 1.5 T_e / crossover_eV)
+        nu_w = electron_scale 0.4965 sqrt(e T_e / m) / (gap (1 - gamma))
+        phi_w = T_e ln((1 - gamma) sqrt(m / (2 pi m_e)))
+
+    gamma is the emission, held at the space-charge limit; electrons collide with the wall at nu_w,
+    and each collision costs 2 T_e + (1 - gamma) phi_w.
+
+    Source: Marks et al., JOSS 8 (2023) 4672; Goebel & Katz, chapter 7.
     """
 
     yield_0: float = 0.54
@@ -136,7 +167,35 @@ def wall_material(
     transition: float = 0.0,
     shielded_T_e_eV: float | None = None,
 ) -> SheathWall:
-    """A wall of a named material: BN-SiO2, BN, alumina, SiC or SiO2; the rest as `SheathWall`."""
+    """A wall of a named material, as a `SheathWall`.
+
+    Parameters
+    ----------
+    name : str
+        BN-SiO2, BN, alumina, SiC or SiO2.
+    electron_scale : float, default 0.9
+        Factor on the collisions of electrons with the wall.
+    ion_scale : float, default 0.5
+        Factor on the loss of ions.
+    plume_collisions : float, default 1.0
+        Fraction of the collisions that remains beyond the exit.
+    plume_power : float, default 1.0
+        Fraction of the power loss that remains beyond the exit.
+    transition : float, default 0.0
+        Length in m over which the fractions change at the exit.
+    shielded_T_e_eV : float, optional
+        Temperature at the walls of a magnetically shielded thruster in eV. None means not shielded.
+
+    Returns
+    -------
+    SheathWall
+        The wall.
+
+    Raises
+    ------
+    ValueError
+        If the material is unknown.
+    """
     if name not in MATERIALS:
         raise ValueError(
             f"there are walls of {list(MATERIALS)}, got {name!r}; another material is "
@@ -151,7 +210,18 @@ def wall_material(
 
 @dataclass(frozen=True)
 class FixedAnode:
-    """An anode with a fixed electron temperature at its face and no sheath drop."""
+    """An anode with a fixed electron temperature at its face and no sheath drop.
+
+    Parameters
+    ----------
+    T_e_eV : float, default 3.0
+        Electron temperature in eV.
+
+    Raises
+    ------
+    ValueError
+        If the temperature is not positive.
+    """
 
     T_e_eV: float = 3.0
 
@@ -161,20 +231,38 @@ class FixedAnode:
 
 @dataclass(frozen=True)
 class AnodeSheath:
-    """A sheath that transmits just the electrons that the current needs.
+    """An anode sheath that transmits just the electrons that the current needs.
 
+    The temperature has no gradient at the face, unless electrons leave the anode.
+
+    Parameters
+    ----------
+    T_e_eV : float, default 2.0
+        Temperature in eV of electrons that leave the anode, and of the first guess.
+    potential_weight : float, default 1.0
+        Weight of V_s in the heat that each electron removes, 2 T + potential_weight V_s. 1 is that
+        of Maxwellian electrons that climb the sheath; HallThruster.jl v0.22 takes 2.
+
+    Raises
+    ------
+    ValueError
+        If the temperature is not positive, or the weight is negative.
+
+    Notes
+    -----
     With n, T and j_i at the face and j_e = I_d/A - j_i, the thermal flux of electrons to the anode
-    would be j_th = e n sqrt(8 e T/(pi m_e))/4; the sheath repels the excess:
+    would be j_th; the sheath repels the excess:
 
-        V_s = -T ln(min(1, j_e/j_th)), and 0 where j_e <= 0.
+        j_th = e n sqrt(8 e T / (pi m_e)) / 4
+        V_s = -T ln(min(1, j_e / j_th)), and 0 where j_e <= 0
 
-    The potential of the plasma at the face is then V_0 + V_s, that is V_s above the anode. Each
-    electron removes the heat 2 T + potential_weight V_s. The weight 1 is that of Maxwellian
-    electrons that climb the sheath (Goebel & Katz, chapter 7; Hara, Plasma Sources Sci. Technol. 28
-    (2019) 044001); HallThruster.jl v0.22 takes 2. The temperature has no gradient at the face,
-    unless electrons leave the anode; these have T_e_eV. Ions leave at sqrt((e T + k T_i)/m)/sqrt(1
-    + chi) or faster, with T of the first cell, chi = exp(-x)/(sqrt(pi x) (1 + erf(sqrt(x)))), x =
-    V_s/T (Hara 2019).
+    The potential of the plasma at the face is then V_0 + V_s, that is V_s above the anode. Ions
+    leave at this speed or faster, with T of the first cell and x = V_s/T:
+
+        sqrt((e T + k T_i) / m) / sqrt(1 + chi)
+        chi = exp(-x) / (sqrt(pi x) (1 + erf(sqrt(x))))
+
+    Source: Goebel & Katz, chapter 7; Hara, Plasma Sources Sci. Technol. 28 (2019) 044001.
     """
 
     T_e_eV: float = 2.0  # temperature of electrons from the anode, and of the first guess

@@ -24,10 +24,28 @@ _OWN: dict[str, ModuleType] = {}  # first part of a dotted name -> its module
 
 
 def for_configs(call: Called) -> Called:
-    """Mark a function or class of your own, so that configs may name it: `@ep.for_configs`.
+    """Mark a function or class of your own, so that configs may name it.
 
     A config can then use `_target_: my_module.crop_twice` for a function in my_module.py, which
-    lies in the folder where the run is started.
+    lies in the folder where the run is started. Code without the mark is refused.
+
+    Parameters
+    ----------
+    call : Called
+        The function or class. Use it as a decorator.
+
+    Returns
+    -------
+    Called
+        The same function or class.
+
+    Examples
+    --------
+    >>> @ep.for_configs
+    ... def crop_twice(field):
+    ...     return field.isel(time=slice(100, -100))
+    >>> crop_twice.__name__
+    'crop_twice'
     """
     setattr(call, MARK, call)  # refers to itself, so that derived classes do not count as marked
     return call

@@ -12,12 +12,12 @@ from ep2sindy.data.readers.hdf5 import HDF5
 from ep2sindy.data.readers.matlab import MATLAB, NPZ
 from ep2sindy.data.readers.netcdf import NETCDF, ZARR
 from ep2sindy.data.readers.source import FileSource, Reader, damage_named, look_at
-from ep2sindy.data.readers.tables import CSV, EXCEL, NPY, PARQUET, TDMS
+from ep2sindy.data.readers.tables import CSV, NPY, TDMS
 from ep2sindy.runtime.screen import joined
 from ep2sindy.trust.memory import check_memory
 
 # The first that takes a file reads it: those by their first bytes, then those by form and ending.
-READERS = (MATLAB, NPY, PARQUET, TDMS, EXCEL, NETCDF, HDF5, NPZ, CSV, HALLTHRUSTER, ZARR)
+READERS = (MATLAB, NPY, TDMS, NETCDF, HDF5, NPZ, CSV, HALLTHRUSTER, ZARR)
 
 READ_LATER = (MATLAB, NETCDF, HDF5, ZARR)  # large variables are read when they are used
 
@@ -68,5 +68,6 @@ def reader_of(path: Path) -> Reader:
     endings = joined([each for r in by_ending for each in r.endings], "or")
     raise ValueError(
         f"a file must be {kinds}, or end in {endings}: "
-        f"{path} begins with {head!r}; its ending may be wrong, or its content damaged"
+        f"{path} begins with {head!r}; its ending may be wrong, or its content damaged; a table of "
+        "Excel or Parquet is saved as CSV, or its pandas.DataFrame given to ep.discover"
     )

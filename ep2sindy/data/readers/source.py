@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
-from zipfile import BadZipFile, ZipFile
 
 import numpy as np
 import pandas as pd
@@ -23,7 +22,7 @@ from ep2sindy.runtime.screen import words_of
 
 PACKED_BY = ("scale_factor", "add_offset")
 
-Form: TypeAlias = Literal["folder", "hdf5", "workbook", "zip", "other"]
+Form: TypeAlias = Literal["folder", "hdf5", "zip", "other"]
 
 
 @dataclass(frozen=True)
@@ -102,17 +101,8 @@ def look_at(path: Path) -> tuple[Form, bytes, str]:
     with path.open("rb") as file:
         head = file.read(16)
     if head.startswith(b"PK"):
-        return "workbook" if _is_workbook(path) else "zip", head, ending
+        return "zip", head, ending
     return "hdf5" if h5py.is_hdf5(path) else "other", head, ending
-
-
-def _is_workbook(path: Path) -> bool:
-    """True for a workbook of Excel, which is a zip archive with a folder `xl`."""
-    try:
-        with ZipFile(path) as archive:
-            return any(name.startswith("xl/") for name in archive.namelist())
-    except BadZipFile:  # damaged: the list of its members stands at its end
-        return path.suffix.lower() in (".xlsx", ".xlsm")
 
 
 def plain(value: Any) -> Any:

@@ -1,13 +1,10 @@
-"""Readers of tables: text of programs and oscilloscopes, Excel, Parquet, TDMS and NumPy."""
+"""Readers of tables: text of programs and oscilloscopes, TDMS and NumPy."""
 
 from __future__ import annotations
 
 import codecs
-import csv
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from io import StringIO
 from itertools import islice
 from pathlib import Path
 from typing import TextIO
@@ -24,7 +21,6 @@ from ep2sindy.data.readers.table_layout import (
     PARTED,
     Layout,
     layout_of,
-    split_names,
 )
 
 N_LOOKED_AT = 2000  # lines examined to find the layout; no known preamble is longer
@@ -49,11 +45,10 @@ def read_csv(path: Path) -> FileSource:
     cell is NaN.
     """
     with path.open(encoding=_encoding(path), newline=None) as file:
-        return text_source(path, file)
+        return _source(path, file)
 
 
-def text_source(path: Path, file: TextIO) -> FileSource:
-    """Source of the table in a text, from its beginning; path: the file that the text is from."""
+def _source(path: Path, file: TextIO) -> FileSource:
     lines = list(islice(file, N_LOOKED_AT))
     layout = layout_of(lines)
     if any(AT_TIMES in line for line in lines[: layout.first]):
@@ -201,79 +196,6 @@ CSV = Reader(
 # Tables that are no text.
 
 
-OLD_EXCEL = b"\xd0\xcf\x11\xe0"
-
-# What Excel shows in a cell whose formula has no value.
-FAULTS = frozenset({"#DIV/0!", "#N/A", "#NAME?", "#NULL!", "#NUM!", "#REF!", "#VALUE!"})
-
-
-def read_excel(path: Path) -> FileSource:
-    """Read a workbook of Excel as text of the same cells would be read; see `read_csv`.
-
-    If several sheets hold tables, a column is called "sheet/column". Sheets without rows of numbers
-    are left out.
-    """
-    with path.open("rb") as file:
-        if file.read(len(OLD_EXCEL)) == OLD_EXCEL:
-            raise ValueError("it is of Excel up to 2003: save it as .xlsx or as CSV")
-    sheets = pd.read_excel(path, sheet_name=None, header=None, na_filter=False, engine="openpyxl")
-    found: dict[str, FileSource] = {}
-    faults: dict[str, str] = {}
-    for name, frame in sheets.items():
-        try:
-            found[str(name)] = text_source(path, _as_text(frame))
-        except ValueError as error:
-            faults[str(name)] = str(error)
-    if not found:
-        stated = "; ".join(f"sheet {name!r}: {text}" for name, text in faults.items())
-        raise ValueError(f"no sheet of it holds a table: {stated}")
-    words = [
-        f"sheet {name!r}: {source.words.replace(' between tabs', '')}"
-        for name, source in found.items()
-    ]
-    words += [f"left out: sheet {name!r}, {text}" for name, text in faults.items()]
-    if len(found) == 1:  # the columns keep their names
-        return replace(*found.values(), words="; ".join(words))
-    places = {f"{sheet}/{name}": (s, name) for sheet, s in found.items() for name in s.names}
-
-    def read(name: str) -> xr.DataArray:
-        source, column = places[name]
-        return source.read(column)
-
-    return FileSource(path, [*places], read, words="; ".join(words), is_table=True)
-
-
-def _as_text(frame: pd.DataFrame) -> StringIO:
-    """Cells of a sheet as text separated by tabs."""
-    text = StringIO()
-    writer = csv.writer(text, delimiter="\t", lineterminator="\n")
-    for row in frame.itertuples(index=False):
-        writer.writerow("" if str(cell) in FAULTS else " ".join(str(cell).split()) for cell in row)
-    text.seek(0)
-    return text
-
-
-def read_parquet(path: Path) -> FileSource:
-    """Read a table of Parquet.
-
-    Its index, if it has a name or holds dates or durations, is its first column. Units may stand in
-    names, as in `read_csv`. Dates are counted from the first one.
-    """
-    frame = pd.read_parquet(path, engine="pyarrow")
-    if frame.index.name is not None or frame.index.dtype.kind in "mM":
-        frame = frame.reset_index()
-    header = split_names([str(name) for name in frame.columns])
-    places = {name: k for k, name in enumerate(header.names)}
-
-    def read(name: str) -> xr.DataArray:
-        return column_array(frame.iloc[:, places[name]], header.units[places[name]])
-
-    n_rows, n_columns = frame.shape
-    return FileSource(
-        path, [*places], read, words=f"{n_columns} columns of {n_rows} rows", is_table=True
-    )
-
-
 def read_npy(path: Path) -> FileSource:
     """Read an array saved with `numpy.save`: its fields if it is structured, or else "array".
 
@@ -292,8 +214,6 @@ def read_npy(path: Path) -> FileSource:
     )
 
 
-EXCEL = Reader("Excel", read_excel, first_bytes=(OLD_EXCEL,), form="workbook", package="openpyxl")
-PARQUET = Reader("Parquet", read_parquet, first_bytes=(b"PAR1",), package="pyarrow")
 NPY = Reader("npy", read_npy, first_bytes=(b"\x93NUMPY",))
 
 # TDMS, which LabVIEW writes.

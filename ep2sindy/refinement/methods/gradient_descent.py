@@ -29,10 +29,29 @@ LBFGS: Optimizer = partial(torch.optim.LBFGS, line_search_fn="strong_wolfe")
 class GradientDescent:
     """Minimise by a torch optimiser, with reverse-mode gradients through torchdiffeq's `rk4`.
 
-    optimizer: function from parameters to an optimiser, such as
-    `partial(torch.optim.Adam, lr=1e-2)`.
-    The fit has converged when the last `patience` steps reduced the loss by less than a fraction
-    `tolerance`.
+    Parameters
+    ----------
+    optimizer : callable, default LBFGS
+        Function from parameters to an optimiser, such as `partial(torch.optim.Adam, lr=1e-2)`.
+    max_iter : int, default 200
+        Most steps of the optimiser.
+    tolerance : float, default 1e-08
+        The fit has converged when the last `patience` steps reduced the loss by less than this
+        fraction.
+    patience : int, default 10
+        Number of those steps.
+    n_substeps : int, default 1
+        Runge-Kutta steps per sample.
+
+    Notes
+    -----
+    Over the scalings s and the starts x_0 of the windows,
+
+        minimise sum_k |W (x(t_k; x_0, s) - data_k)|^2
+
+    where x is integrated through the whole window, states are in units of their standard deviation,
+    and W weights them. Long windows of chaotic systems have many local minima; `MultipleShooting`
+    avoids them.
     """
 
     optimizer: Optimizer = LBFGS

@@ -51,30 +51,48 @@ FINE = 1e-3
 class MultipleShooting:
     """Damped Gauss-Newton on nodes and scalings together, in stages of growing memory.
 
-    Over the scalings s and a node x_k at every sample of every window it minimises
-        sum_k |W (x_k - data_k)|^2   subject to   x_(k+1) = F_k(x_k, s),
-    where F_k integrates the equations over one step, states in units of their standard deviation
-    and W weighs them. It assumes residuals of constant variance in each state.
+    Each iteration integrates every step of every window in one call, with tangents, and solves for
+    the scalings, with each window's start eliminated by QR. In a stage, every step ends at (1 -
+    1/memory) times its own end plus 1/memory times the data, so that what happened more than
+    `memory` samples ago is forgotten, and no trajectory diverges. The last stages follow the model
+    only. If a stage does not close the gaps between steps, it is tried again by way of the
+    geometric mean of its memory and the last one's. A step must lower the sum of squared residuals
+    plus a penalty times the gaps; if it does not, it is undone and the next one is damped
+    (Levenberg-Marquardt), in units of what each scaling does to the trajectories. So no iteration
+    leaves the finite numbers. Each point has its own steps and leaves once it has converged.
 
-    Each iteration integrates every step of every window in one call, with tangents, and solves
-    for the scalings, with each window's start eliminated by QR. In a stage, every step ends at
-    (1 - 1/memory) times its own end plus 1/memory times the data, so that what happened more than
-    `memory` samples ago is forgotten, and no trajectory runs away. The memory is `first_memory`
-    samples, then `growth` times as many, up to the window's length; the last stages have no pull.
-    If a stage does not close the gaps between steps, it is tried again by way of the geometric
-    mean of its memory and the last one's.
-    A step must lower the sum of squared residuals plus a penalty times the gaps; if it does not, it
-    is undone and the next one is damped (Levenberg-Marquardt), in units of what each scaling
-    does to the trajectories. So no iteration leaves the finite numbers.
-    Each point has its own steps and leaves once it has converged.
-    tolerance: convergence requires the relative change of every scaling, and the gaps, to be
-    below it.
+    Parameters
+    ----------
+    step : Step, default ONE_RUNGE_KUTTA
+        How one step from sample to sample is integrated: `RungeKutta` or `FusedRungeKutta`.
+    first_memory : int, default 5
+        Memory of the first stage, in samples.
+    growth : float, default 5.0
+        Factor by which the memory grows from stage to stage, up to the window's length.
+    tolerance : float, default 1e-07
+        Convergence requires the relative change of every scaling, and the gaps, to be below it.
+    max_iter : int, default 50
+        Most iterations.
+
+    Notes
+    -----
+    Over the scalings s and a node x_k at every sample of every window,
+
+        minimise sum_k |W (x_k - data_k)|^2   subject to   x_(k+1) = F_k(x_k, s)
+
+    where F_k integrates the equations over one step, states are in units of their standard
+    deviation, and W weights them. Assumes residuals of constant variance in each state.
+
     Source: Bock 1983, doi:10.1007/978-1-4684-7324-7_7; Abarbanel et al. 2009,
-    doi:10.1137/090749761 for the pull.
+    doi:10.1137/090749761, for the attraction to the data.
 
+    Examples
+    --------
     >>> system = ep.lotka_volterra()
     >>> method = ep.refinement.MultipleShooting(tolerance=1e-9)
     >>> refined = ep.refine(system.model, system.trajectory(noise=0.02, rng=0), method=method)
+    >>> str(refined.status)
+    'converged'
     """
 
     step: Step = ONE_RUNGE_KUTTA

@@ -117,7 +117,6 @@ def _circuit(thruster: Thruster, point: OperatingPoint, end_s: float) -> dict[st
     """Supply and circuit of a model; a voltage that varies is taken at steps of SUPPLY_STEP_S."""
     volts, rate = np.array([point.voltage]), 0.0
     if point.supply is not None:
-        point.supply.check(point.voltage, end_s)
         n_steps = math.ceil(end_s / SUPPLY_STEP_S)
         check_memory(8.0 * n_steps, f"duration_s = {end_s:g} s", hint="simulate less of it")
         volts = point.supply.at(SUPPLY_STEP_S * np.arange(n_steps + 2.0), point.voltage)

@@ -59,6 +59,6 @@ def to_json(parameters: dict[str, Any]) -> str:
             return {name: plain(member) for name, member in value.items()}
         if callable(value):  # a user's; what holds it has a hash of its source besides
             return f"{value.__module__}.{value.__qualname__}"
-        return list(value) if isinstance(value, tuple) else value
+        return [plain(each) for each in value] if isinstance(value, tuple) else value
 
     return json.dumps(plain(parameters), sort_keys=True)

@@ -78,24 +78,63 @@ def simulate(
 ) -> xr.Dataset:
     """Simulate one operating point and record it at equal steps after a warm-up.
 
-    averaged: record averages over each sampling step, like probes and the output of most codes,
-    with the products and fluxes that close its balance; False records the values at its end, which
-    alias faster oscillations. stretch: length of the plume's cells relative to the channel's; 1
-    makes all equal. reconstruct: use van Leer's slopes; False: fluxes of first order, of heat too.
-    coldest_T_e_eV: lower bound of T_e, like the 1.5 eV of HallThruster.jl; the energy balance then
-    lacks the added heat. initial: `GuessedStart` (None), `ColdStart`, `SoftStart`, or the end of
-    another run, given as its Dataset or NetCDF file. cache: folder in which this simulation is
-    kept, or from which it is read, with the same values; True: your cache folder. The file's name
-    holds a hash of all parameters and of the sources: a changed formula gives no old result.
-
-    Returns a Dataset on ("time", "z"), time in s from the end of the warm-up, with fields
-    (float32) and series (float64); docs/thruster.md lists them. Its attributes hold the
-    parameters as JSON, `initial`, `status` (see `assess_status`; also out and diverged), `cycle`,
-    `f_kHz`, mean and standard deviation of I_d, thrust, specific impulse and efficiency, and
-    `mass_balance` and `energy_balance` (out plus stored over in).
     A diverged run ends at its last finite sample and has that status; it is not an error.
-    Raises ValueError for settings that cannot be run, OSError for a cache that cannot be written.
 
+    Parameters
+    ----------
+    thruster : Thruster
+        The thruster.
+    operating_point : OperatingPoint
+        Its voltage and flow.
+    duration_s : float, default 0.018
+        Length of the record in s.
+    warm_up_s : float, default 0.002
+        Time in s that is simulated before the record.
+    sample_s : float, default 1.5e-06
+        Sampling step in s.
+    averaged : bool, default True
+        True records averages over each sampling step, like probes and the output of most codes,
+        with the products and fluxes that close the balance. False records the values at the end of
+        the step, which alias faster oscillations.
+    n_cells : int, default 100
+        Number of cells of the grid.
+    stretch : float, default 2.0
+        Length of the plume's cells relative to the channel's. 1 makes all equal.
+    reconstruct : bool, default True
+        True uses van Leer's slopes, False fluxes of first order, also of heat.
+    cfl : float, default CFL
+        Courant number (CFL), which limits the time step; above 0, at most 1.
+    coldest_T_e_eV : float, default 0.0
+        Lower bound of T_e, like the 1.5 eV of HallThruster.jl. The energy balance then lacks the
+        added heat.
+    initial : GuessedStart, ColdStart, SoftStart, Restart, Dataset or path, optional
+        The initial state. None takes `GuessedStart()`; a Dataset or a NetCDF file continues from
+        the end of another run.
+    cache : str, Path or bool, optional
+        Folder in which this simulation is stored, or from which it is read, with the same values.
+        True takes your cache folder. The file's name holds a hash of all parameters and of the
+        sources, so that a changed formula never yields an old result.
+    progress : Progress or bool, default True
+        True shows a bar.
+
+    Returns
+    -------
+    Dataset
+        The record over ("time", "z"), with time in s from the end of the warm-up: fields (float32)
+        and series (float64), listed in docs/thruster.md. Its attributes hold the parameters as
+        JSON, `initial`, `status` (see `assess_status`), `cycle`, `f_kHz`, mean and standard
+        deviation of I_d, thrust, specific impulse and efficiency, and `mass_balance` and
+        `energy_balance` (out plus stored over in).
+
+    Raises
+    ------
+    ValueError
+        If the settings cannot be run.
+    OSError
+        If the cache cannot be written.
+
+    Examples
+    --------
     >>> point = ep.thruster.OPERATING_POINTS[3]
     >>> field = ep.thruster.simulate(
     ...     ep.thruster.Thruster(), point, duration_s=5e-5, warm_up_s=0.0, progress=False

@@ -97,7 +97,19 @@ class GuessedStart:
 class ColdStart:
     """A hard start: a thin, cold, uniform plasma in a channel full of gas, which then ignites.
 
-    n_i: m^-3. u_i: m/s. T_e_eV: eV.
+    Parameters
+    ----------
+    n_i : float, default 3e+17
+        Density of the ions in m^-3.
+    u_i : float, default 1000.0
+        Speed of the ions in m/s.
+    T_e_eV : float, default 3.0
+        Electron temperature in eV.
+
+    Raises
+    ------
+    ValueError
+        If a number is not positive.
     """
 
     n_i: float = 3e17
@@ -121,7 +133,17 @@ class ColdStart:
 class SoftStart:
     """A soft start: a discharge kept quiet by a high series resistance, which is then removed.
 
-    resistance: ohm. hold_s: duration of the quiet phase, in s.
+    Parameters
+    ----------
+    resistance : float, default 40.0
+        Series resistance in the quiet phase, in ohm.
+    hold_s : float, default 0.0015
+        Duration of the quiet phase in s.
+
+    Raises
+    ------
+    ValueError
+        If a number is not positive.
     """
 
     resistance: float = 40.0
@@ -141,11 +163,20 @@ class SoftStart:
 
 @dataclass(frozen=True, eq=False)
 class Restart:
-    """The end of another run, from which this one continues: `Restart(run)` or `Restart(path)`.
+    """The end of another run, from which this one continues.
 
-    run: a Dataset of `simulate`, or the path of a NetCDF file of one. The operating point, the
-    transport and the circuit may differ; on another grid the profiles are interpolated.
-    Raises ValueError if it is not such a run, if it diverged, or if its thruster differs.
+    The operating point, the transport and the circuit may differ. On another grid the profiles are
+    interpolated.
+
+    Parameters
+    ----------
+    run : Dataset or str or Path
+        A Dataset of `simulate`, or the path of a NetCDF file of one.
+
+    Raises
+    ------
+    ValueError
+        If it is not such a run, it diverged, or its thruster differs.
     """
 
     run: xr.Dataset | str | Path

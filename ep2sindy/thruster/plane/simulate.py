@@ -88,15 +88,46 @@ def simulate_2d(
 ) -> xr.Dataset:
     """Simulate one operating point in (z, r) and sample it at equal steps after a warm-up.
 
-    averaged: if True, a sample is the mean over the sampling step that ends at its time; otherwise
-    it is the state at that time, which aliases oscillations faster than half the sampling rate.
-    cache: as in `simulate`; with the default settings the file takes some 300 MB.
+    The electrons are quasi-one-dimensional, so that T_e_eV and R_ion do not depend on r. A diverged
+    run ends at its last finite sample and has that status; it is not an error.
 
-    Returns a Dataset on ("time", "z", "r"), time in s from the end of the warm-up: PLANES on all
-    three (float32, NaN in the thruster's body), PROFILES in time and z, SERIES in time (float64).
-    The electrons are quasi-one-dimensional, so T_e_eV and R_ion do not depend on r. Attributes are
-    as in `simulate`. A diverged run ends at its last finite sample and has that status. Raises
-    ValueError for settings that cannot be run, OSError for a cache that cannot be written.
+    Parameters
+    ----------
+    thruster : Thruster, default THRUSTER_2D
+        The thruster.
+    operating_point : OperatingPoint, default OPERATING_POINT_2D
+        Its voltage and flow.
+    duration_s : float, default 0.018
+        Length of the record in s.
+    warm_up_s : float, default 0.002
+        Time in s that is simulated before the record.
+    sample_s : float, default 1.5e-06
+        Sampling step in s.
+    n_z : int, default 41
+        Number of grid points along z.
+    n_r : int, default 49
+        Number of grid points along r.
+    averaged : bool, default True
+        True records the mean over the sampling step that ends at each time. False records the state
+        at that time, which aliases oscillations faster than half the sampling rate.
+    cache : str, Path or bool, optional
+        As in `simulate`. With the default settings the file takes some 300 MB.
+    progress : Progress or bool, default True
+        True shows a bar.
+
+    Returns
+    -------
+    Dataset
+        The record over ("time", "z", "r"), with time in s from the end of the warm-up: PLANES over
+        all three (float32, NaN in the thruster's body), PROFILES over time and z, SERIES over time
+        (float64). Attributes are as in `simulate`.
+
+    Raises
+    ------
+    ValueError
+        If the settings cannot be run.
+    OSError
+        If the cache cannot be written.
     """
     settings: dict[str, Any] = {
         "duration_s": duration_s, "warm_up_s": warm_up_s, "sample_s": sample_s,
