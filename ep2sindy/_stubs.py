@@ -133,4 +133,4 @@ def _near(absent: str) -> str:
     near = [each for word in alike for each in known if known[each] == word]
     if not near:
         return look
-    return f"{look}; near it {'is' if len(near) == 1 else 'are'} {', '.join(near)}"
+    return f"{look} (did you mean {', '.join(near)}?)"

@@ -99,10 +99,10 @@ def test_a_study_is_built_from_its_signature() -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ("nn=1", r"unknown keys \['nn'\]; near it is n; there are \["),
+        ("nn=1", r"unknown keys \['nn'\] \(did you mean n\?\); keys are \["),
         ("n=0", "n must be a whole number, one or more: got 0"),
         ("names=[a,a]", r"names must be a list such as \[a,b\], each once"),
-        ("inner.widht=1", r"^inner, Inner: .*; near it is width; it takes \['width', 'label'\]"),
+        ("inner.widht=1", r"^inner, Inner: .*mean width\?\); it takes \['width', 'label'\]"),
         (
             "rows=[{width: 1, hight: 2}]",
             r"rows\[0\], Inner: got an unexpected .* 'hight'",
@@ -210,7 +210,7 @@ def test_a_sweep_goes_on_after_a_failed_job_and_says_so(
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        ([], "error: choose an experiment with +exp=NAME; there are benchmark, breathing"),
+        ([], "error: choose an experiment with +exp=NAME: benchmark, breathing"),
         (["+exp=discover", "data=file", "data.path=x"], "trajectory.states must be set: it is"),
         (["+exp=breathing", "output=/proc/none"], "choose another with output=PATH"),
     ],

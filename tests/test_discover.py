@@ -115,7 +115,7 @@ def test_what_an_equation_leaves_tells_whether_a_term_is_missing(recipe: AnyMeth
     left = lacking.noise_test.left.values()
     assert not any(each.leaves_noise for each in left)
     assert min(each.autocorrelation for each in left) > 0.3
-    assert "no equation of this library leaves white noise of x'" in lacking.lack_of_fit
+    assert "no equation of this library explains x'" in lacking.lack_of_fit
     assert lacking.lack_of_fit in lacking.note
     assert lacking.model.covariance is None
 
@@ -232,9 +232,9 @@ def test_a_rule_that_assess_free_runs_says_a_lack_of_fit_where_others_do() -> No
     assert found.noise_test.tested
     assert found.lack_of_fit == ""
     poor = discover(run, named_terms(["x", "y"], ["x", "y"]), recipe)
-    assert "leaves white noise of x'" in poor.lack_of_fit
+    assert "explains x'" in poor.lack_of_fit
     by_rows = discover(run, named_terms(["x", "y"], ["x", "y"]), replace(recipe, selection=EBIC()))
-    assert "leaves white noise of x'" in by_rows.lack_of_fit
+    assert "explains x'" in by_rows.lack_of_fit
 
 
 def test_the_test_of_a_trajectory_search_is_not_that_of_another_model() -> None:
@@ -245,12 +245,12 @@ def test_the_test_of_a_trajectory_search_is_not_that_of_another_model() -> None:
     still = discover(run, library, TrajectorySearch(selection=BySize(sign=1)))
     assert not still.model.coef.any()
     assert still.estimate.lack_of_fit == ""
-    assert "leaves white noise" in still.lack_of_fit
+    assert "to within white noise" in still.lack_of_fit
     poor = discover(
         run, library.take(np.array([True, True, False])), TrajectorySearch(selection=BySize(sign=1))
     )
     assert poor.estimate.lack_of_fit
-    assert "leaves white noise" in poor.lack_of_fit
+    assert "to within white noise" in poor.lack_of_fit
 
 
 def test_samples_too_few_for_weak_rows_are_assessed_by_none() -> None:
@@ -301,4 +301,4 @@ def test_a_rest_is_assessed_by_the_instants_at_which_all_was_measured() -> None:
     missing[::3, 1] = True
     run = Trajectory(t, states, ["x", "y"], missing=missing)
     found = discover(run, polynomial(["x", "y"], degree=0), PLAIN)
-    assert "leaves x at rest" in found.lack_of_fit or "noise of x'" in found.lack_of_fit
+    assert "leaves x at rest" in found.lack_of_fit or "explains x'" in found.lack_of_fit

@@ -402,7 +402,7 @@ def test_an_equation_with_all_the_terms_that_it_may_have_is_a_lack_of_fit() -> N
     run, library = system.trajectory(noise=0.05, rng=0), system.model.library
     found = ep.estimate([run], library, max_terms=3)
     assert found.lack_of_fit.startswith(
-        "y' with as many terms as may be (max_terms=3): they may stand"
+        "y' with as many terms as are allowed (max_terms=3): they may stand"
     )
     assert found.model.covariance is None
     known = {"y": ["x", "y", "x*z"]}

@@ -46,7 +46,12 @@ def test_a_mark_is_written_as_it_is_read() -> None:
         (
             "ep2sindy",
             "Eebic",
-            r"no attribute 'Eebic'; see dir\(ep2sindy\); near it (is|are) ep2sindy.EBIC",
+            r"no attribute 'Eebic'; see dir\(ep2sindy\) \(did you mean .*ep2sindy.EBIC",
+        ),
+        (
+            "ep2sindy.thruster",
+            "crop",
+            r"dir\(ep2sindy.thruster\) \(did you mean .*data.crop\?\)$",
         ),
         ("ep2sindy", "_nothing", r"no attribute '_nothing'; see dir\(ep2sindy\)$"),
     ],

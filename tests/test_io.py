@@ -249,7 +249,7 @@ def npz(path: Path, **changes: np.ndarray) -> Path:
         (
             {},
             {"variables": {"n_i": Variable("nii", "m^-3")}},
-            r"no variable 'nii' .*; near it .*'ni'.*; it holds t \(6\), z \(4\), r \(3\), ",
+            r"no variable 'nii' .* \(did .*'ni'.*\?\); it holds t \(6\), z \(4\), r \(3\), ",
         ),
         (
             {"ni": N_I[:5]},

@@ -13,9 +13,9 @@ from tests.programs import composed, ended
 @pytest.mark.parametrize(
     ("typed", "message"),
     [
-        (["+exp=breathin"], "there is no experiment 'breathin'; near it is +exp=breathing; there"),
+        (["+exp=breathin"], "unknown experiment 'breathin' (did you mean +exp=breathing?); choose"),
         (["+ex=breathing"], "an experiment is chosen with +exp=breathing, got '+ex=breathing'"),
-        (["inspct", "run.csv"], "got 'inspct'; near it is the command inspect, which stands fi"),
+        (["inspct", "run.csv"], "got 'inspct' (did you mean the command inspect, which stands fi"),
         (["+exp=discover", "exclude={x: [x^2]}"], "must stand in double quotes inside single ones"),
     ],
 )

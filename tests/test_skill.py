@@ -48,7 +48,7 @@ def test_a_span_begins_at_the_first_horizon_and_ends_with_the_gain() -> None:
 def test_errors_above_the_mean_s_are_no_forecast() -> None:
     found = skill(model=errors(1.5), autoregression=errors(3.0, seed=1))
     assert not found.is_better
-    assert "the mean of the record is nearest" in found.text
+    assert "the mean of the record is best" in found.text
 
 
 def test_one_start_or_equal_errors_tell_nothing() -> None:

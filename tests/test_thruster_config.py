@@ -47,7 +47,7 @@ def test_experiments_take_a_thruster(experiment: str) -> None:
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("+data.thruster.chanel_length=0.02", r"Thruster: .*'chanel_length'; near it are"),
+        ("+data.thruster.chanel_length=0.02", r"Thruster: .*'chanel_length' \(did you mean"),
         ("data.thruster.anode._target_=ep2sindy.Anode", r"data\.thruster\.anode must name a _targ"),
     ],
 )

@@ -137,9 +137,9 @@ def _no_choice(error: MissingConfigException) -> str:
     options = sorted(error.options or ())
     if not group or not options:
         return str(error).partition("\nConfig search path")[0]
-    what = "experiment" if group == "exp" else f"choice of {group}"
+    what = "experiment" if group == "exp" else f"alternative of {group}"
     near = near_words(name, options, form="+exp={}" if group == "exp" else f"{group}={{}}")
-    return f"there is no {what} {name!r}{near}; there are {listed(options)}"
+    return f"unknown {what} {name!r}{near}; choose from {listed(options)}"
 
 
 def _no_key(key: str, config: DictConfig) -> str:
@@ -160,6 +160,6 @@ def _no_key(key: str, config: DictConfig) -> str:
         if name in taken - names:
             return f"{key!r} is left to its default here: a plus sets it, +{key}=VALUE"
         names |= taken
-    whose = f"{place} has" if place else "there are"
-    free = f"; a new one, where any may stand, takes a plus: +{key}" if place else ""
+    whose = f"{place} has" if place else "keys are"
+    free = f"; a new one, where any is allowed, takes a plus: +{key}" if place else ""
     return f"unknown key {key!r}{near}; {whose} {listed(sorted(names - {'_target_'}))}{free}"

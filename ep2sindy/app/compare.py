@@ -109,7 +109,7 @@ def read_run(folder: Path, number: int) -> ReadRun:
     Raises ValueError for a folder that is not a run, or a run that ended early.
     """
     if not folder.is_dir():
-        raise ValueError(f"a run is a folder: {folder} is not there; {_nearby(folder)}")
+        raise ValueError(f"a run must be a folder: there is no {folder}; {_nearby(folder)}")
     if not (folder / "summary.json").is_file():
         stated = "it ended early, see its run.log" if (folder / "run.log").is_file() else "no run"
         raise ValueError(f"{folder} has no summary.json: {stated}; {_nearby(folder)}")
@@ -146,8 +146,8 @@ def _nearby(folder: Path) -> str:
     for place in (folder, folder.parent, Path("outputs")):
         found = sorted(path.parent for path in place.glob("**/summary.json"))[-3:]
         if found:
-            return f"runs there are, for example {', '.join(map(str, found))}"
-    return "a run's folder is the one that it prints last"
+            return f"there are runs such as {', '.join(map(str, found))}"
+    return "the folder of a run is the one that it prints last"
 
 
 def compare_runs(runs: Sequence[ReadRun], figures: Sequence[str], *, beside: Path) -> list[Section]:

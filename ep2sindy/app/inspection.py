@@ -88,7 +88,7 @@ def main(arguments: Sequence[str], conf: Path) -> None:
         more = ["data.plasma=true"] if given.plasma else []
         path = _hydra(given.path)
         lines = commands(found, "recognised", pattern, path=path, more=more, drives=drives)
-        end = f"--write makes conf/data/{name}.yaml of it, for data={name}"
+        end = f"--write writes this to conf/data/{name}.yaml, for data={name}"
     else:
         file = own_config(name, conf)
         write_text(file, config_text(found, paths))

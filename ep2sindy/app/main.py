@@ -169,7 +169,7 @@ def _no_experiment(typed: Sequence[str], conf: Path) -> ValueError:
         if value in names and near_words(key, ["exp", "experiment"]):
             return ValueError(f"an experiment is chosen with +exp={value}, got {text!r}")
     return ValueError(
-        f"choose an experiment with +exp=NAME; there are {listed(names)}. A config of your own "
+        f"choose an experiment with +exp=NAME: {listed(names)}. A config of your own "
         "begins with the line '# @package _global_'"
     )
 

@@ -76,7 +76,7 @@ def study_of(study: type, config: DictConfig) -> Any:
         if "thruster" in unknown:  # a file of ./conf/thruster that lacks its first line
             hint = "; a file of conf/thruster begins with the line '# @package data.thruster'"
         near = "".join(near_words(name, known) for name in sorted(unknown))
-        raise ValueError(f"unknown keys {sorted(unknown)}{near}; there are {sorted(known)}{hint}")
+        raise ValueError(f"unknown keys {sorted(unknown)}{near}; keys are {sorted(known)}{hint}")
     if isinstance(config.get("points"), str) and OmegaConf.is_missing(config.data, "path"):
         config.data.path = None  # the points name the files
     for place, value in nodes_of(OmegaConf.to_container(config)):

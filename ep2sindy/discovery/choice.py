@@ -244,8 +244,8 @@ def _describe_lack_of_fit(left: Mapping[str, Residual], related: Collection[str]
             "or assess the model by free run"
         )
     return (
-        f"no equation of this library leaves white noise of {parts}: intervals are not given; "
-        "add terms or states, or assess the model by free run"
+        f"no equation of this library explains {parts} to within white noise: intervals are not "
+        "given; add terms or states, or assess the model by free run"
     )
 
 

@@ -437,8 +437,8 @@ def fit_offset(
             return shift + rest, shift + low, shift + high
     raise ValueError(
         f"offset=fit asks for equations of {past.name} with an offset and of its growth rate that "
-        "explain it to its noise: none of this library do; write offset=NUMBER, as the sensor's "
-        "mean is known, or leave it out"
+        "explain it to within its noise: none of this library do; write offset=NUMBER if the "
+        "sensor's mean is known, or leave offset out"
     )
 
 

@@ -143,7 +143,7 @@ def _unfinished(best: Solution | TrajectoryFit, ended: str) -> Explanation:
         words = f"the search was {ended}: other starts and terms were not tried"
         return _explanation(solution, data_warnings=(words,))
     words = (
-        f"the search was {ended}, and nothing fits as far as the noise yet: the equations are the "
+        f"the search was {ended}, and nothing fits to within the noise yet: the equations are the "
         "best so far; raise limit_s, or take fewer terms"
     )
     return _explanation(solution, words)
@@ -362,7 +362,7 @@ def _lack_of_fit(found: Solution) -> str:
         )
     else:
         words = (
-            "no model of this library fits these data as far as their noise: "
+            "no model of this library fits these data to within their noise: "
             f"{'; '.join(found.signs)}. The equations are the nearest found; add terms ({more}) or "
             "states, or assess them by free run"
         )
@@ -388,9 +388,9 @@ def _at_limit(found: Solution) -> str:
     if not full:
         return ""
     return (
-        f"{', '.join(full)} with as many terms as may be (max_terms={found.problem.most_terms}): "
-        "they may stand for one that the library lacks, and intervals are not given; add terms to "
-        "it, or raise max_terms"
+        f"{', '.join(full)} with as many terms as are allowed "
+        f"(max_terms={found.problem.most_terms}): they may stand for one that the library lacks, "
+        "and intervals are not given; add terms to it, or raise max_terms"
     )
 
 

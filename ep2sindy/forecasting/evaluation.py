@@ -258,7 +258,7 @@ class Evaluation:
             return ""
         return (
             "the cycle is neutral: it neither attracts nor repels, and every start has a cycle of "
-            "its own, so the model says nothing of what sets the amplitude"
+            "its own, so the model does not show what sets the amplitude"
         )
 
     @property

@@ -180,7 +180,7 @@ class ForecastSkill:
         rival = f"an autoregression (AR {self.order})" if self.order else WORDS[self.rival]
         if not self.is_better:
             nearest = self.nearest
-            return f"no better than {rival}" + f"; {nearest} is nearest" * (
+            return f"no better than {rival}" + f"; {nearest} is best" * (
                 nearest != WORDS[self.rival]
             )
         span = self._span(self.better_until_periods)

@@ -207,7 +207,7 @@ class Roles:
         for role in self._roles:
             if isinstance(role.how, str) and role.how == KNOWN and role.name not in known:
                 raise ValueError(
-                    f"{role.name!r} is not known of this record, which gives {dict(known)}: what "
+                    f"{role.name!r} is not known for this record, which gives {dict(known)}: what "
                     f"enters follows from the mass flow, for the neutrals of a zone that begins at "
                     f"the anode of a simulated thruster, and the rest from its balance; give "
                     f"numbers, or {FREE!r}"

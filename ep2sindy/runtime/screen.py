@@ -120,12 +120,12 @@ def html_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def near_words(name: str, names: Iterable[str], *, form: str = "{}") -> str:
-    """`; near it is NAME` for the similar ones among some names; empty if there are none.
+    """` (did you mean NAME?)`, of the similar ones among some names; empty if there are none.
 
     form: how a name is written.
     """
     near = get_close_matches(name, sorted(set(names)), n=3)
-    return f"; near it {'is' if len(near) == 1 else 'are'} {listed(near, form)}" if near else ""
+    return f" (did you mean {listed(near, form)}?)" if near else ""
 
 
 def listed(names: Iterable[str], form: str = "{}") -> str:

@@ -213,8 +213,8 @@ def report_unknown_drive(signal: Signal) -> str | None:
     if PhaseRecord.of(signal.t, signal.x, signal.cycle).has_moving_phase:
         return None
     return (
-        f"this record does not tell whether {signal.name} sustains itself or is driven: its phase "
-        "moves from period to period by no more than its noise, as a clean cycle's and a clock's do"
+        f"this record does not show whether {signal.name} sustains itself or is driven: its phase "
+        "moves between periods by no more than its noise, as in a clean cycle and in a clock"
     )
 
 

@@ -46,7 +46,7 @@ NOISE = (
     "the square of the state. Kurtosis: 3 where it is normal, more with outliers."
 )
 FITS = (
-    "The model explains the samples as far as their noise: what is left looks like noise, and "
+    "The model explains the samples to within their noise: what is left looks like noise, and "
     "an exact trajectory is likelier than one that leaves the model."
 )
 REPLACED = (

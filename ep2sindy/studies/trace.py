@@ -59,9 +59,8 @@ from ep2sindy.studies.views import CYCLE, EVALUATED, EVALUATION, add_samples, fo
 
 NAME = "trace"  # of the model, in files
 NOT_EXPLAINED = (
-    "no equations of the signal and states that nobody measured explain it to its noise and "
-    "sustain its oscillation: "
-    "states are made by smoothing"
+    "no equations of the signal and of hidden states both explain it to within its noise and "
+    "sustain its oscillation: states are made by smoothing"
 )
 
 LINEAR = (

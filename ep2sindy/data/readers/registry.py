@@ -61,7 +61,7 @@ def reader_of(path: Path) -> Reader:
             (most, n), *_ = counts.most_common(1)
             hint = f"; take its {n} files that end in {most}, '{path}/*{most}'"
         raise ValueError(
-            f"a file must come, or a folder that ends in {folders}: {path} is a folder{hint}"
+            f"the path must be a file, or a folder that ends in {folders}: {path} is a folder{hint}"
         )
     by_ending = [r for r in READERS if r.form in ("other", "folder")]
     kinds = joined([r.name for r in READERS if r not in by_ending], "or")
