@@ -28,16 +28,6 @@ def test_names_need_no_quotes_when_typed(key: str, name: str) -> None:
     assert value_of(f"{key}={name}") == name
 
 
-def test_names_in_lists_and_mappings_may_have_any_letters() -> None:
-    states = value_of("trajectory.states=[Düse_ä,b,'c_ü']")
-    assert list(map(str, states)) == ["Düse_ä", "b", "c_ü"]
-    assert value_of("data.variables={a:{name:größe,unit:V}}") == {
-        "a": {"name": "größe", "unit": "V"}
-    }
-    assert value_of("data.path=[a.csv,ü.csv]") == ["a.csv", "ü.csv"]
-    assert value_of("data.path=${oc.env:HOME}") == "${oc.env:HOME}"
-
-
 @pytest.mark.usefixtures("here")
 def test_a_comma_parts_jobs_of_a_sweep_unless_it_stands_in_a_name() -> None:
     (found,) = OverridesParser.create().parse_overrides([mend("data.path=a.csv,b.csv")])

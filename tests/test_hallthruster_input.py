@@ -8,7 +8,6 @@ import pytest
 
 import ep2sindy as ep
 from benchmarks.hallthruster_input import read_hallthruster_input, simulate_hallthruster_input
-from ep2sindy.thruster.constants import K_BOLTZMANN
 
 Z = np.linspace(0.0, 0.08, 41)
 FIELD = "\n".join(f"{z}, {0.02 * np.exp(-(((z - 0.025) / 0.012) ** 2))}" for z in Z)
@@ -80,22 +79,6 @@ def test_the_field_is_read_from_next_to_the_file_in_m_and_T(folder: Path) -> Non
     )
 
 
-def test_a_field_within_the_file_needs_no_other(tmp_path: Path) -> None:
-    within = {"file": "", "z": Z.tolist(), "B": [0.01] * Z.size}
-    content = changed(thruster=THRUSTER | {"magnetic_field": within})
-    field = read(tmp_path, content).thruster.magnetic_field
-    np.testing.assert_allclose(field.at(np.zeros(1)), 0.01)
-
-
-def test_a_temperature_alone_gives_the_neutrals_a_quarter_of_their_thermal_speed(
-    folder: Path,
-) -> None:
-    flow = {"gas": "Xe", "flow_rate_kg_s": 5e-6, "temperature_K": 500.0, "allowed_charges": [1]}
-    made = read(folder, changed(propellants=[flow]))
-    speed = np.sqrt(8.0 * K_BOLTZMANN * 500.0 / (np.pi * made.thruster.propellant.mass))
-    assert made.operating_point.neutral_speed == pytest.approx(0.25 * speed)
-
-
 TWO_ZONES = ep.thruster.AnomalousTransport(0.01, 0.05, 0.1 * 0.025)
 MODELS = [
     ({"type": "Bohm", "c": 0.02}, ep.thruster.AnomalousTransport(0.02, 0.02, 0.0)),
@@ -112,68 +95,10 @@ MODELS = [
 ]
 
 
-@pytest.mark.parametrize(("node", "expected"), MODELS, ids=lambda v: type(v).__name__)
-def test_transport_is_counted_from_the_exit(folder: Path, node: dict, expected: object) -> None:
-    assert read(folder, changed(anom_model=node)).thruster.transport == expected
-
-
-def test_walls_conduction_and_anode_follow_the_file(folder: Path) -> None:
-    made = read(
-        folder,
-        changed(
-            wall_loss_model={"type": "WallSheath", "material": "Alumina", "loss_scale": 0.5},
-            ion_wall_losses=True,
-            electron_plume_loss_scale=0.2,
-            transition_length=4e-3,
-            conductivity_model={"type": "Braginskii"},
-            anode_boundary_condition="dirichlet",
-            anode_Tev=3.0,
-            electron_ion_collisions=False,
-        ),
-    ).thruster
-    assert made.wall == ep.thruster.wall_material(
-        "alumina", electron_scale=0.5, ion_scale=0.5, plume_collisions=0.0, plume_power=0.2,
-        transition=4e-3,
-    )  # fmt: skip
-    assert (made.conduction_factor, made.conduction_coulomb) == (pytest.approx(6.99), 0.0)
-    assert made.anode == ep.thruster.FixedAnode(3.0)
-    assert np.all(made.propellant.coulomb(np.ones(3)) == 0.0)
-
-
 SHIFTED = {
     "type": "LogisticPressureShift", "model": MODELS[3][0], "z0": -0.1, "dz": 0.2, "pstar": 4e-5,
     "alpha": 15.0,
 }  # fmt: skip
-
-
-def test_a_pressure_shifts_the_transport_in_channel_lengths(folder: Path) -> None:
-    made = read(folder, changed(anom_model=SHIFTED, background_pressure_Torr=1e-5))
-    shifted = made.thruster.transport
-    assert shifted.transport == MODELS[3][1]
-    assert shifted.pressure_Pa == pytest.approx(4e-5 * 133.322, rel=1e-5)
-    pressure_Pa = made.operating_point.background.pressure_Pa
-    assert pressure_Pa == pytest.approx(1e-5 * 133.322, rel=1e-5)
-    assert shifted.shift(pressure_Pa) == pytest.approx(-0.1 + 0.2 / (1.0 + 14.0**-0.5))
-
-
-def test_ingestion_takes_the_number_in_Torr_for_one_in_Pa(folder: Path) -> None:
-    """As their stored runs: u_n n_n at the anode of ref_spt100_baseline leaves 1e18 1/(m^2 s)."""
-    gas = {"background_pressure_Torr": 1e-5, "background_temperature_K": 300.0}
-    made = read(folder, changed(**gas, neutral_ingestion_multiplier=6.0))
-    mass, thermal = made.thruster.propellant.mass, K_BOLTZMANN * 300.0
-    flux = 6.0 * 1e-5 / thermal * 0.25 * np.sqrt(8.0 * thermal / (np.pi * mass))
-    flow = made.operating_point.inflow_mg_s(made.thruster) - 5.0
-    assert flow == pytest.approx(1e6 * flux * mass * made.thruster.area)
-    still = read(folder, changed(neutral_ingestion_multiplier=6.0)).operating_point
-    assert still.background is None
-
-
-@pytest.mark.parametrize("corrected", [True, False])
-def test_a_plume_that_is_solved_is_thermal(folder: Path, corrected: bool) -> None:
-    content = changed(solve_plume=True, apply_thrust_divergence_correction=corrected)
-    expected = ep.thruster.ThermalPlume(axial_thrust=corrected)
-    assert read(folder, content).thruster.plume == expected
-    assert read(folder, changed(apply_thrust_divergence_correction=True)).thruster.plume is None
 
 
 @pytest.mark.parametrize(

@@ -79,16 +79,6 @@ def test_layouts_are_stated_from_their_content(tmp_path: Path, layout: str, enco
     np.testing.assert_allclose(arrays[1].values, X, rtol=1e-8)
 
 
-@pytest.mark.parametrize("ending", ["csv", "tsv", "txt", "dat", "asc", "prn", "CSV"])
-def test_text_goes_by_many_endings_and_columns_by_their_number(tmp_path: Path, ending: str) -> None:
-    path = tmp_path / f"a.{ending}"
-    path.write_text("when;current\n" + rows(T, X, sep=";", decimal=","))
-    field = ep.open_field(
-        path, variables={"I_d": ep.data.Variable("1", "mA")}, time=ep.data.Variable("0", "s")
-    )
-    np.testing.assert_allclose(field["I_d"].values, 1e-3 * X, rtol=1e-8)
-
-
 def test_rigol_counts_its_samples_and_says_the_step_next_to_the_names(tmp_path: Path) -> None:
     text = "X,CH1,Start,Increment,\nSequence,Volt,-6.0e-03,1.5e-06\n"
     (tmp_path / "a.csv").write_text(text + rows(np.arange(30), X, end=","))
@@ -110,12 +100,6 @@ def test_empty_cells_and_words_for_missing_are_nan(tmp_path: Path) -> None:
     source = open_source(tmp_path / "a.csv")
     np.testing.assert_array_equal(source.read("x").values, [1, np.nan, 4, 5, 6, 7])
     np.testing.assert_array_equal(source.read("y").values, [2, 3, *[np.nan] * 3, 8])
-
-
-def test_a_preamble_of_thousands_of_rows_below_is_read_whole(tmp_path: Path) -> None:
-    n = 5000
-    (tmp_path / "a.csv").write_text("made by x\n\nt,x\n" + rows(np.arange(n), np.arange(n) / 2))
-    assert open_source(tmp_path / "a.csv").read("x").values[-1] == (n - 1) / 2
 
 
 MANY = rows(np.arange(3000.0), np.arange(3000.0))
