@@ -287,12 +287,6 @@ def test_marks_of_overload_that_repeat_are_missing_samples(tmp_path: Path, mark:
     assert run.n_samples == NT - 2
 
 
-def test_a_number_that_looks_like_a_mark_stays_among_its_like(tmp_path: Path) -> None:
-    x = np.where(np.arange(NT) % 2, 32767.0, 32000.0 * np.sin(np.arange(NT)))
-    path = write_csv(tmp_path / "a.csv", t_s=T, x=x)
-    np.testing.assert_allclose(ep.open_field(path)["x"].values, x, rtol=1e-15)
-
-
 def test_a_long_table_is_refused_by_name(tmp_path: Path) -> None:
     t, z = np.repeat(T, NZ), np.tile(Z, NT)
     path = write_csv(tmp_path / "a.csv", t_s=t, z=z, x=WAVE[:, :, 0].ravel())

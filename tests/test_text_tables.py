@@ -169,21 +169,6 @@ def test_stretches_that_a_file_joins_are_not_made_even(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "column", "unit"),
-    [
-        ("rotifers (animals/ml)", "rotifers", "animals/ml"),
-        ("index (foo/bar/baz)", "index", "1"),
-    ],
-)
-def test_a_slash_in_a_unit_is_no_path(tmp_path: Path, name: str, column: str, unit: str) -> None:
-    (tmp_path / "a.csv").write_text(f"t_s,{name}\n" + rows(T, X))
-    assert ep.inspect_file(tmp_path / "a.csv").variables[column].unit == unit
-    field = ep.open_field(tmp_path / "a.csv")
-    assert field[column].attrs["units"] == unit
-    np.testing.assert_allclose(field[column].values, X, rtol=1e-8)
-
-
-@pytest.mark.parametrize(
     ("name", "unit", "seconds"),
     [
         ("Year", "year", 31557600.0), ("day", "day", 86400.0), ("Time (h)", "h", 3600.0),
@@ -216,13 +201,6 @@ def test_the_whole_file_decides_which_columns_are_kept(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("t_s,ends,begins\n" + "\n".join(lines) + "\n")
     held = {each.name: each for each in ep.inspect_file(tmp_path / "a.csv").held}
     assert (held["ends"].n_missing, held["begins"].n_missing) == (n - 50, 2500)
-
-
-def test_a_line_of_separators_and_marks_of_clipping_are_missing_samples(tmp_path: Path) -> None:
-    (tmp_path / "a.csv").write_text("t_s,x\n0,1\n,\n1,∞\n2,****\n3,2\n")
-    field = ep.open_field(tmp_path / "a.csv")
-    np.testing.assert_array_equal(field["time"].values, [0, 1, 2, 3])
-    np.testing.assert_array_equal(field["x"].values, [1, np.nan, np.nan, 2])
 
 
 @pytest.mark.parametrize(
