@@ -22,7 +22,6 @@ STRAIGHT = ", ".join(f"{{V_D_V: {300 + 10 * k}, mdot_mg_s: {4 + k}}}" for k in r
     [
         ("benchmark", ["noises=[0.1,-0.1]"], "noises[1] must be numbers, zero or more: got -0.1"),
         ("benchmark", ["variants=[our]"], "unknown variants ['our']; there are "),
-        ("benchmark", ["definitions.ours={_target_:builtins.dict}"], "must name a _target_"),
         ("breathing", ["trajectory.zone.z=[0.5,0.6]"], "a zone must hold grid points"),
         ("breathing", ["libraries.simple.variables=[n_i,q]"], "unknown variables ['q']; this fie"),
         ("constrained", ["~models.velocity.terms.n_i"], "velocity.terms must list the terms"),
@@ -37,7 +36,6 @@ STRAIGHT = ", ".join(f"{{V_D_V: {300 + 10 * k}, mdot_mg_s: {4 + k}}}" for k in r
         ("predict", [f"points=[{FEW}]"], "a law of 3 functions of ['V_D_V', 'mdot_mg_s'] needs m"),
         ("predict", [f"points=[{STRAIGHT}]"], "4 points do not tell the 3 terms of a law apart"),
         ("weak", ["fits.boxes.form=box"], "fits.boxes.form must be null, balance or one of ['boxe"),
-        ("weak", ["fits.boxes.n_points=[1201]"], "1201 samples were asked of 1200; lower n_points"),
     ],
 )
 def test_settings_that_cannot_work_are_refused(

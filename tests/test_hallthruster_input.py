@@ -72,13 +72,6 @@ def test_the_tutorial_has_the_defaults_that_its_stored_run_names(folder: Path) -
     assert (run.reconstruct, run.coldest_T_e_eV) == (True, 1.5)
 
 
-def test_the_field_is_read_from_next_to_the_file_in_m_and_T(folder: Path) -> None:
-    field = read(folder, changed(magnetic_field_scale=2.0)).thruster.magnetic_field
-    np.testing.assert_allclose(
-        field.at(Z - 0.025), 0.04 * np.exp(-(((Z - 0.025) / 0.012) ** 2)), rtol=1e-12
-    )
-
-
 TWO_ZONES = ep.thruster.AnomalousTransport(0.01, 0.05, 0.1 * 0.025)
 MODELS = [
     ({"type": "Bohm", "c": 0.02}, ep.thruster.AnomalousTransport(0.02, 0.02, 0.0)),

@@ -148,15 +148,6 @@ def test_units_of_a_preamble_are_those_of_the_columns(tmp_path: Path) -> None:
     assert ep.inspect_file(tmp_path / "a.csv").time == ep.data.Variable("TIME", "s")
 
 
-def test_a_gap_that_a_preamble_knows_nothing_of_stays_and_is_reported(tmp_path: Path) -> None:
-    times = np.where(np.arange(len(T)) < 15, T, T + 4e-4)
-    path = tektronix(tmp_path / "a.csv", times)
-    np.testing.assert_allclose(ep.open_field(path)["time"].values, times, atol=1e-18)
-    notes = " ".join(ep.inspect_file(path).notes())
-    assert "'TIME' have a gap: 0.0004015 pass after row 15, where steps are 1.5e-06" in notes
-    assert "the file says steps of 1.5e-06 s next to them; the times are taken" in notes
-
-
 def test_rounded_times_take_the_step_of_the_preamble(tmp_path: Path) -> None:
     path = tektronix(tmp_path / "a.csv", np.round(T, 5))
     np.testing.assert_allclose(ep.open_field(path)["time"].values, T, atol=1e-18)
