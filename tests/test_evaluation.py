@@ -177,7 +177,7 @@ def test_a_neutral_cycle_is_stated_and_every_start_has_its_own() -> None:
     assert found.rest is not None
     np.testing.assert_allclose(found.rest.state, [1 / 3, 2 / 3], rtol=1e-9)
     assert found.rest.frequency_Hz == pytest.approx(np.sqrt(2.0) / 3.0 / (2.0 * np.pi))
-    assert "neither grows nor decays and turns at 75.03 mHz" in found.cycle_text
+    assert "neither grows nor decays and oscillates at 75.03 mHz" in found.cycle_text
 
 
 def test_an_attracting_cycle_has_its_multiplier_and_rests_inside() -> None:

@@ -94,13 +94,15 @@ def explain(
         return _unreadable(error.override, error.message.strip().partition("\n")[0])
     if isinstance(error, MissingConfigException):
         return _no_choice(error)
-    stated = str(error).partition("\nSee https")[0]
-    found = re.match(r"Could not (override|delete from config\.) '?([^'\s]+?)'(?:\.| does)", stated)
+    message = str(error).partition("\nSee https")[0]
+    found = re.match(
+        r"Could not (override|delete from config\.) '?([^'\s]+?)'(?:\.| does)", message
+    )
     if found is None:
         cause = str(error.__cause__ or "").strip().partition("\n")[0]
-        return ": ".join(filter(None, [stated, cause])) + "; --cfg job shows what a config has"
+        return ": ".join(filter(None, [message, cause])) + "; --cfg job shows what a config has"
     key = found[2]
-    if "No match in the defaults list" in stated:
+    if "No match in the defaults list" in message:
         typed = next((text for text in settings if _key(text) == key), key)
         return f"{typed!r} adds to the config, which needs a plus: write +{typed}"
     try:

@@ -111,8 +111,8 @@ def read_run(folder: Path, number: int) -> ReadRun:
     if not folder.is_dir():
         raise ValueError(f"a run must be a folder: there is no {folder}; {_nearby(folder)}")
     if not (folder / "summary.json").is_file():
-        stated = "it ended early, see its run.log" if (folder / "run.log").is_file() else "no run"
-        raise ValueError(f"{folder} has no summary.json: {stated}; {_nearby(folder)}")
+        reason = "it ended early, see its run.log" if (folder / "run.log").is_file() else "no run"
+        raise ValueError(f"{folder} has no summary.json: {reason}; {_nearby(folder)}")
     with damage_named(folder / "summary.json"):
         summary = read_json((folder / "summary.json").read_text("utf-8"))
         about = {"experiment": str(summary["experiment"]), "seed": str(summary["seed"])}
@@ -122,8 +122,8 @@ def read_run(folder: Path, number: int) -> ReadRun:
         }
         clock = Clock.of(summary.get("data", {}).get("time_unit", "s"))
     with damage_named(folder / "provenance.json"):
-        stated = read_json((folder / "provenance.json").read_text("utf-8"))
-        provenance = {"commit": "-", "versions": {}, **stated}
+        loaded = read_json((folder / "provenance.json").read_text("utf-8"))
+        provenance = {"commit": "-", "versions": {}, **loaded}
     with damage_named(folder / "config.yaml"):
         config: Any = OmegaConf.to_container(OmegaConf.load(folder / "config.yaml"))
         placed = [by_place(str(key), each) for key, each in config.items() if key != "output"]

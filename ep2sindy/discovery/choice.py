@@ -241,11 +241,11 @@ def _describe_lack_of_fit(left: Mapping[str, Residual], related: Collection[str]
         return (
             f"the model leaves more than white noise of {parts} under its relations: intervals are "
             "not given; check the relations, weigh the rows (WeightedWeak()), add terms or states, "
-            "or assess the model by free run"
+            "or test the model by free run"
         )
     return (
         f"no equation of this library explains {parts} to within white noise: intervals are not "
-        "given; add terms or states, or assess the model by free run"
+        "given; add terms or states, or test the model by free run"
     )
 
 

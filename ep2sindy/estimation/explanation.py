@@ -364,7 +364,7 @@ def _lack_of_fit(found: Solution) -> str:
         words = (
             "no model of this library fits these data to within their noise: "
             f"{'; '.join(found.signs)}. The equations are the nearest found; add terms ({more}) or "
-            "states, or assess them by free run"
+            "states, or test them by free run"
         )
     sign = unobserved_state(found.problem)
     return f"{words}. A state is missing for certain: {sign}. {ADVICE}" if sign else words

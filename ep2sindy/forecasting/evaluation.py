@@ -288,11 +288,13 @@ class Evaluation:
             for state, value in zip(self.model.states, rest.state.tolist(), strict=True)
         )
         kind, change = ("unstable", "grows") if rest.growth_per_s > 0.0 else ("stable", "decays")
-        rate = f" by {clock.seconds * abs(rest.growth_per_s):.3g} {clock.rate_unit('1')}"
+        rate = f" at {clock.seconds * abs(rest.growth_per_s):.3g} {clock.rate_unit('1')}"
         if abs(rest.growth_per_s) <= NEUTRAL * rest.frequency_Hz or self._stays(rest):
             kind, change, rate = "neutral", "neither grows nor decays", ""
         turns = (
-            f" and turns at {clock.frequency_text(rest.frequency_Hz)}" if rest.frequency_Hz else ""
+            f" and oscillates at {clock.frequency_text(rest.frequency_Hz)}"
+            if rest.frequency_Hz
+            else ""
         )
         return f"{place}, {kind}: a perturbation {change}{rate}{turns}"
 

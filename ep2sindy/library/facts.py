@@ -74,7 +74,7 @@ class Facts:
 
     @property
     def places(self) -> list[Place]:
-        """Every (state, term) that an equation is stated to have."""
+        """Every (state, term) that an equation must have."""
         named = [(state, term) for r in self.relations for _, state, term in r.factors]
         named += [(state, term) for state, terms in self.only.items() for term in terms]
         return [*named, *self.known_factors]

@@ -35,10 +35,10 @@ _IN_PYTHON = re.compile(r"NoneType|zip\(\)|no attribute|values to unpack")
 
 def words_of(error: BaseException) -> str:
     """What an error says of the file that was read, in one line and without words about code."""
-    stated = " ".join(str(error).split()).removesuffix(".")
-    if isinstance(error, _INTERNAL) or " " not in stated or _IN_PYTHON.search(stated):
+    message = " ".join(str(error).split()).removesuffix(".")
+    if isinstance(error, _INTERNAL) or " " not in message or _IN_PYTHON.search(message):
         return "it is damaged, or of another kind than its name says"
-    return stated
+    return message
 
 
 def say(text: str, *, error: bool = False) -> None:

@@ -33,9 +33,8 @@ MAINS_Hz, MAINS_ERROR, MAINS_STATED = (50.0, 60.0, 100.0, 120.0), 1e-3, 3e-3
 # A year has 365 to 365.25 days. Two decades hold three periods: an error of 0.02 is rarely met.
 CALENDAR, CALENDAR_ERROR, CALENDAR_STATED = ("day", "year"), 1e-3, 0.02
 
-MIN_PERIODS_OF_PHASE = (
-    20  # fewest periods in which a phase that returns is stated from one that walks
-)
+# Fewest periods in which a phase that returns is distinguished from one that walks.
+MIN_PERIODS_OF_PHASE = 20
 # Mean square of a random walk of n unit steps about its best line, over n: one in a hundred walks
 # of twenty steps is below this, and fewer of longer ones (simulated).
 LEAST_WALK = 0.0147

@@ -80,7 +80,7 @@ def _source(path: Path, file: TextIO) -> FileSource:
 
 
 def _holds_numbers(column: pd.Series) -> bool:
-    """True for a column of numbers that begins beyond the lines that the layout is stated from."""
+    """True for a column of numbers that begins beyond the lines that determine the layout."""
     return column.dtype.kind in "fiu" and bool(column.notna().any())
 
 
