@@ -39,6 +39,7 @@ def test_the_law_of_a_long_record_is_found_in_its_means() -> None:
     assert not found.lack_of_fit
 
 
+@pytest.mark.slow
 def test_an_input_that_is_held_is_averaged_with_the_states() -> None:
     """A lag of half a step between means of states and input would show as a delayed channel."""
     run = damped(held=400)

@@ -486,6 +486,7 @@ def test_what_cannot_be_estimated_is_refused() -> None:
         ep.estimate([run.window(0, 6)], ep.polynomial(["x", "y"], degree=2))
 
 
+@pytest.mark.slow
 def test_a_library_without_the_constant_where_a_state_drifts_is_a_lack_of_fit() -> None:
     rng = np.random.default_rng(0)
     t = np.linspace(0.0, 20.0, 100)
@@ -689,6 +690,7 @@ def test_squares_whose_sum_overflows_are_infinite_and_warn_of_nothing() -> None:
         assert fit.total == np.inf
 
 
+@pytest.mark.slow
 def test_a_path_that_misses_the_steps_of_its_model_is_no_trajectory() -> None:
     """What the continuation lets pass may hold up a model: y' = a x - b x z, b = 5e3, z' = 0."""
     rng = np.random.default_rng([5, 300, 3])

@@ -47,6 +47,7 @@ def record(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return scope(tmp_path_factory.mktemp("scope") / "scope.csv", *signal(24.0))
 
 
+@pytest.mark.slow
 def test_hidden_states_that_do_not_fit_are_shown_if_asked_for(tmp_path: Path) -> None:
     t = np.linspace(0.0, 50.0, 501)
     path = scope(tmp_path / "scope.csv", t, np.sin(t) ** 3)  # no linear equations make it
@@ -78,6 +79,7 @@ def test_one_column_of_a_file_becomes_a_sustained_model(record: Path, tmp_path: 
     assert tried["error"] < 0.3
 
 
+@pytest.mark.slow
 def test_a_signal_of_either_sign_can_be_taken(tmp_path: Path) -> None:
     t = 0.12 * np.arange(850)  # 16 periods
     run = ep.systems.van_der_pol(mu=0.5).model.simulate(t, [2.0, 0.0])
@@ -178,6 +180,7 @@ def test_one_column_of_a_file_becomes_the_law_with_intervals(record: Path, tmp_p
     assert found["evaluations"]["trace"]["status"] == "sustained"
 
 
+@pytest.mark.slow
 def test_a_mean_that_was_lost_is_fitted_with_its_interval(tmp_path: Path) -> None:
     t, x = signal(12.0)
     noisy = x + 0.02 * x.std() * np.random.default_rng(0).standard_normal(len(x))

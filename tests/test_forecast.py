@@ -84,6 +84,7 @@ def test_nothing_but_the_past_enters() -> None:
     np.testing.assert_array_equal(skills[0].example.states, skills[1].example.states)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("system", "noise"), [(ep.lorenz(), 0.05), (ep.lotka_volterra(), 0.2)])
 def test_bands_hold_what_they_say(system, noise) -> None:
     run = system.trajectory(noise=noise, rng=1)
@@ -98,6 +99,7 @@ def test_bands_hold_what_they_say(system, noise) -> None:
     assert skill.text.endswith("periods and more")
 
 
+@pytest.mark.slow
 def test_bands_grow_where_the_record_is_moved_by_process_noise() -> None:
     run = spring(0.02, momentum_gain=0.05)
     low, high = ep.forecast(SPRING, run, 30.0).band()
@@ -120,6 +122,7 @@ def driven_spring(n: int = 1200) -> Trajectory:
     return Trajectory(t, noisy, ("x", "v"), u[:, None], ("u",))
 
 
+@pytest.mark.slow
 def test_inputs_are_known_ahead_to_model_and_autoregression() -> None:
     run = driven_spring()
     skill = ep.model.forecast_skill(DRIVEN, run, n_fitted=900, starts=20)
@@ -149,6 +152,7 @@ def test_bands_are_as_wide_as_forecasts_of_the_past_were_off() -> None:
     assert skills[1].example.width[-1, 0] > 3.0
 
 
+@pytest.mark.slow
 def test_widths_are_the_same_however_often_and_in_what_unit_they_are_asked_for() -> None:
     run = spring(0.05, momentum_gain=0.02).window(0, 400)
     once, again = (calibrate(tune_estimator(SPRING, run), run).widths for _ in range(2))
@@ -287,6 +291,7 @@ def test_a_model_that_runs_away_forecasts_without_breaking() -> None:
     assert ahead.diverged > 0.5
 
 
+@pytest.mark.slow
 def test_rounded_samples_are_compared_as_they_are() -> None:
     run = spring(0.0)
     step = 0.2 * run.states.std()

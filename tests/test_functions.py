@@ -389,6 +389,7 @@ def test_a_pendulum_is_found_in_noise_and_runs_on_its_own(
     assert assessed.status in (ep.model.Status.SUSTAINED, ep.model.Status.WRONG_FREQUENCY)
 
 
+@pytest.mark.slow
 def test_intervals_hold_the_truth_where_functions_bend_in_noise() -> None:
     """Without what noise adds to sin on average, errors have a mean of 3.5 standard deviations."""
     library = named_terms(["theta", "w"], ["w", "sin(theta)"])

@@ -103,6 +103,7 @@ def test_states_that_nobody_measured_follow_the_model_on_both_sides_of_a_gap() -
     assert off.std() < 0.15 * WHOLE.columns(["y"]).std()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("since", [1, 40])
 def test_a_forecast_starts_from_the_samples_since_the_last_gap(since: int) -> None:
     past = GAPPY.window(0, FIRST + since)

@@ -79,6 +79,7 @@ def test_the_model_tells_the_hidden_states_of_a_record() -> None:
         assert np.sqrt(np.square(off).mean()) < 0.02 * clean.std()
 
 
+@pytest.mark.slow
 def test_forecasts_need_the_measured_states_alone(found: ep.Discovery) -> None:
     run = only("x")
     ahead = ep.forecast(found.model, run.window(0, 800), 10.0)
@@ -171,6 +172,7 @@ def test_only_positive_states_have_growth_rates_which_come_first() -> None:
         assert known.hidden == ()
 
 
+@pytest.mark.slow
 def test_ways_are_followed_that_process_noise_explains(monkeypatch: pytest.MonkeyPatch) -> None:
     followed = []
 

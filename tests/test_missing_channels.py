@@ -92,6 +92,7 @@ def test_masks_that_mean_nothing_are_refused(missing: np.ndarray, message: str) 
         ep.Trajectory(np.arange(5.0), states, ["x", "y"], missing=missing)
 
 
+@pytest.mark.slow
 def test_an_equation_that_is_closed_holds_next_to_one_that_is_not() -> None:
     """Lorenz without z: x' = 10 (y - x) needs no z, and y' does."""
     run = LORENZ.trajectory(noise=0.05, rng=0).window(0, 900)

@@ -35,6 +35,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+@pytest.mark.slow
 def test_two_commands_lead_from_a_file_to_its_equations(
     folder: Path, capsys: pytest.CaptureFixture
 ) -> None:

@@ -26,6 +26,7 @@ def searched(run: ep.Trajectory, settings: SustainedSearch) -> ep.Discovery:
     return settings.found(run, library, ROWS, rng=np.random.default_rng(0))
 
 
+@pytest.mark.slow
 def test_in_noise_the_mean_cycle_is_searched_and_reported() -> None:
     run = record(0.5)
     found = searched(run, SETTINGS)

@@ -251,6 +251,7 @@ def many_terms() -> System:
     return System("many terms", model, np.array([0.5, 0.5]), 30.0, 40.0)
 
 
+@pytest.mark.slow
 def test_an_equation_may_have_more_terms_than_seven() -> None:
     """Seven are tried first, then more, since the library has more than twice as many."""
     system = many_terms()
