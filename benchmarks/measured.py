@@ -11,7 +11,7 @@ lie in the folder of EP2SINDY_DATA. Prints the tables of docs/trace.md.
 
 `sentences` tests what heads the result, over all records and over signals that follow a square
 wave or are noise about a sine: whether the held-out part bears it out, whether a driven signal is
-reported to live without a question, and how much the bands hold.
+reported as sustained without a question, and how much the bands hold.
 """
 
 from __future__ import annotations
@@ -139,7 +139,7 @@ def is_true(forecast: dict[str, Any]) -> str:
 class Record:
     """A record of one signal. unit: of its times. driven: whether something else moves it.
 
-    is_sustained: whether it repeats one cycle, so that a model of it may be reported to sustain it.
+    is_sustained: whether it repeats one cycle, so that a model of it may sustain it.
     """
 
     name: str

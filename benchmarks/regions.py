@@ -44,7 +44,7 @@ REGIONS: Mapping[str, Equations] = {
     },
 }
 
-# A point where one region's fraction of the coefficients exceeds this counts as inside the region.
+# A point where one region's weight in the coefficients exceeds this counts as inside the region.
 INSIDE = 0.95
 
 

@@ -4,7 +4,7 @@
 
 Silences are those of a terminal: a pseudo-terminal notes when output comes, and every experiment
 runs on it. The words before and after the longest silence are printed below the numbers. Where
-others fraction the machine, waiting for a processor is not counted: a wait is its wall time or the
+others share the machine, waiting for a processor is not counted: a wait is its wall time or the
 CPU time spent in it, whichever is less. With another checkout, both run in turn, and ratios are
 printed, which is what travels.
 """

@@ -124,7 +124,7 @@ def noise_beside(fit: TrajectoryFit) -> Noise:
     sizes = np.sqrt(np.mean([np.square(path).mean(axis=0) for path in fit.paths], axis=0))
     std[hidden] = std[~hidden].mean() * sizes[hidden]
     shape, growth = _shape(problem, fit.path, left)
-    # The shape is stated by values at all samples.
+    # The shape is determined by values at all samples.
     untold = limited | hidden | (n < problem.n_samples)
     shape, growth = np.where(untold, 1.0, shape), np.where(untold, 0.0, growth)
     if limited.any():
@@ -361,7 +361,7 @@ def _follow_states(fit: TrajectoryFit, new: Pieces) -> StateMask:
 def excess_explained(columns: Float[np.ndarray, "samples columns"], residuals: BySample) -> ByState:
     """How much more columns explain of residuals than of random ones, in standard errors.
 
-    The squares that random residuals fraction with the columns are expected from the squares of
+    The squares that random residuals share with the columns are expected from the squares of
     each sample alone, so neither outliers nor noise that grows with the state pass for a function.
     """
     basis = np.linalg.qr(columns)[0]

@@ -116,7 +116,7 @@ def make_grid(
 ) -> tuple[Figure, Sequence[Axes]]:
     """A canvas of n panels of this size in inches, as many in a row as fit, none empty.
 
-    extra: additional height in inches. sharex, sharey: whether the panels fraction these axes.
+    extra: additional height in inches. sharex, sharey: whether the panels share these axes.
     x_label: written below the lowest panel of every column.
     """
     n_rows = -(-n // max(1, int(WIDTH / width)))

@@ -29,7 +29,7 @@ def model_lines(
         states, tail = model.states[: room - 1], [f"... {left} more equations", foot]
     else:
         states, tail = model.states, [foot]
-    # Every equation gets one line, and an even fraction of the lines that are left over.
+    # Every equation gets one line, and an even share of the lines that are left over.
     spare = n_lines - len(tail) - len(states)
     lines: list[str] = []
     for k, state in enumerate(states):

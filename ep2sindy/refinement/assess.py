@@ -312,7 +312,7 @@ def covariances(
     holds the residual that no change of the scalings can reduce.
     The residuals of a cluster are those of a fit to the other clusters (CR3, the jackknife). The
     covariance is widened by the quantile of Student's t for their number. Overlapping windows
-    fraction noise, so their scores are correlated, with weights that fall with distance. With too
+    share noise, so their scores are correlated, with weights that fall with distance. With too
     few windows for a sandwich, the naive covariance replaces it. n_residuals: number of residuals
     minus the number of starts and scalings. Source: Bell & McCaffrey 2002, Surv. Methodol. 28, 169;
     Newey & West 1987, doi:10.2307/1913610 for the weights.

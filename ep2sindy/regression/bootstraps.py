@@ -103,7 +103,7 @@ class Bootstraps:
             parts = [half.draw(problem, terms, rng) for half in halves]
             return np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts])
         group = problem.groups[~problem.test]
-        if (group[1:] > group[:-1]).all():  # each row alone, which is stated at a tenth of the cost
+        if (group[1:] > group[:-1]).all():  # each row alone, which is found at a tenth of the cost
             counts, kept = self.draw_groups(len(group), terms, rng)
             return problem.resampled_products(counts), kept
         numbers, group = np.unique(group, return_inverse=True)

@@ -367,7 +367,7 @@ class Weak:
 
 @dataclass(frozen=True, eq=False)
 class _Sampled:
-    """Terms, windows of each state, and segments of one segment of samples without gaps.
+    """Terms, windows of each state, and segments of a run of samples without gaps.
 
     names: the library's variables, then states that it lacks.
     segment: (samples,), number of the time segment that holds the sample. held_out: (samples,),

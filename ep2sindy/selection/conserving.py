@@ -35,7 +35,7 @@ def search_conserving_systems(
 
         minimise sum over equations e of |y_e - X_e (A_e z + d_e)|^2 / s_e^2 over supports of z
 
-    z holds one amount per process, and column p of A_e its fraction in every term of equation e,
+    z holds one amount per process, and column p of A_e its factor in every term of equation e,
     d_e what is known. So a search proposes processes, and what they move is conserved exactly. s_e
     is the standard deviation of what the whole library leaves of y_e; assumes residuals that are
     independent between rows and equations. Of every size, the `depth` best systems are kept in
