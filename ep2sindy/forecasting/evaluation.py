@@ -186,6 +186,17 @@ class Evaluation:
             return float("nan")
         return float(self._slip[-1])
 
+    @property
+    def phase_text(self) -> str:
+        """For how long it is in phase, and the lag at the end if it still is; empty if unknown."""
+        if not np.isfinite(self.periods):
+            return ""
+        text, ahead = f"in phase for {self.periods:.3g} periods", self.phase_end
+        if not abs(ahead) <= IN_PHASE:
+            return text
+        side = "ahead" if ahead > 0.0 else "behind"
+        return f"{text}, {abs(ahead):.2g} of a period {side} at the end"
+
     @cached_property
     def cycle(self) -> LimitCycle | None:
         """The closed orbit on which the run ends; None if it ends on none, or is driven."""
@@ -308,14 +319,13 @@ class Evaluation:
             f"{self.cycle.stability}, multiplier {self.multiplier:.3g}; "
             f"{100.0 * self.basin_stability:.0f} % of starts reach it"
         )
-        phase = f"in phase for {self.periods:.3g} periods; {self.phase_end:+.2g} periods at the end"
         found = [
             ("forecasts", "" if self.forecast is None else self.forecast.text),
             ("status", self.text),
             ("frequency", _listed(frequencies) + error),
             ("amplitude ratio", _listed(_sizes(self.amplitude_ratio))),
             ("waveform error", _listed(_texts(self.waveform_error), STD)),
-            ("phase", phase if np.isfinite(self.phase_end) else ""),
+            ("phase", self.phase_text if np.isfinite(self.phase_end) else ""),
             ("cycle", cycle or ""),
             *(("rests at", self._rest_text(rest)) for rest in self.rest_points[:N_SHOWN]),
             ("lack of fit", self.lack_of_fit),

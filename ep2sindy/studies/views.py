@@ -12,7 +12,7 @@ import pandas as pd
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.figures import series
-from ep2sindy.forecasting.evaluation import IN_PHASE, Evaluation, size_text
+from ep2sindy.forecasting.evaluation import Evaluation, size_text
 from ep2sindy.forecasting.skill import ForecastSkill
 from ep2sindy.library.relations import Constraint
 from ep2sindy.model.comparison import Status
@@ -201,18 +201,10 @@ def run_words(run: Evaluation) -> str:
     waveforms = [value for value in run.waveform_error.values() if np.isfinite(value)]
     if waveforms:
         found.append(f"waveform within {max(waveforms):.2g} standard deviations")
-    if np.isfinite(run.periods):
-        found.append(f"in phase for {round(run.periods)} periods{_lag_words(run.phase_end)}")
+    found += filter(None, [run.phase_text])
     if not found and np.isfinite(run.nrmse):
         found.append(f"{size_text(run.nrmse, '.2g')} standard deviations off")
     return "; ".join(found) or run.text
-
-
-def _lag_words(ahead: float) -> str:
-    """`, 0.12 of a period behind at the end`; empty if a run has lost the phase."""
-    if not abs(ahead) <= IN_PHASE:
-        return ""
-    return f", {abs(ahead):.2g} of a period {'ahead' if ahead > 0.0 else 'behind'} at the end"
 
 
 def _size(ratio: float) -> str:
