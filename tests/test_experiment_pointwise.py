@@ -7,6 +7,7 @@ import xarray as xr
 from omegaconf import DictConfig, OmegaConf
 
 from benchmarks.regions import TERMS, three_regions
+from ep2sindy.app import runner
 from ep2sindy.app.runner import run_config
 from ep2sindy.app.schema import study_of
 from ep2sindy.data.open import write_field
@@ -144,6 +145,28 @@ def test_a_run_that_was_broken_off_ends_with_the_same_file(
     one, other = (xr.load_dataset(each.folder / "pointwise.nc") for each in (whole, rest))
     xr.testing.assert_identical(one, other)
     assert "going on with the pieces" in rest.log
+
+
+def test_two_parts_give_the_file_of_one_run(
+    grid: Path, toy_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("EP2SINDY_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(runner, "precompile", lambda: None)  # into the new cache
+    config = [*on_file(grid, tmp_path), "keep=true"]
+    first, last = (run_config(composed(*config, f"parallel.part=[{k},2]")) for k in (1, 2))
+    assert (
+        "part 1 of 2 is done, and its pieces are kept; 3 pieces" in (first / "run.log").read_text()
+    )
+    assert not (first / "report.html").exists()
+    xr.testing.assert_identical(
+        *(xr.load_dataset(folder / "pointwise.nc") for folder in (toy_run, last))
+    )
+    assert not list(tmp_path.rglob("output.pkl"))  # removed once all is written
+
+
+def test_a_part_that_is_not_kept_is_refused(grid: Path, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"got part=\[1, 2\] where none are kept"):
+        run_config(composed(*on_file(grid, tmp_path), "parallel.part=[1,2]"))
 
 
 def test_continuity_is_found_at_every_point_of_a_simulated_channel(tmp_path: Path) -> None:

@@ -6,6 +6,8 @@ import pytest
 from omegaconf import DictConfig
 
 from benchmarks import known_laws
+from ep2sindy.app import runner
+from ep2sindy.app.runner import run_config
 from ep2sindy.app.schema import study_of
 from ep2sindy.operating.law import OperatingLaw
 from ep2sindy.operating.map import map_points
@@ -68,6 +70,19 @@ def test_the_run_leaves_a_law_tables_figures_and_a_summary(folder: Path) -> None
     at = (*points.loc[1, ["V_D_V", "mdot_mg_s"]], "n_i", "n_n")
     assert both["law"][at] == alone["point_1_law", "n_i", "n_n"]
     assert both["alone"][at] == alone[f"point_1_{law['fit']}", "n_i", "n_n"]
+
+
+@pytest.mark.slow
+def test_two_parts_give_the_law_of_one_run(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("EP2SINDY_CACHE", str(tmp_path / "kept"))
+    monkeypatch.setattr(runner, "precompile", lambda: None)  # into the new cache
+    given = [*toy(tmp_path), POINTS, "keep=true"]
+    first, last = (run_config(composed(*given, f"parallel.part=[{k},2]")) for k in (2, 1))
+    assert "part 2 of 2 is done, and its pieces are kept" in (first / "run.log").read_text()
+    for name in ("law.json", "tables/coefficients.csv", "tables/left_out.csv", "tables/map.csv"):
+        assert (last / name).read_bytes() == (folder / name).read_bytes()
 
 
 def test_the_law_of_a_run_gives_models_in_python(folder: Path) -> None:

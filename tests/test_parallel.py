@@ -4,17 +4,22 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import joblib
 import numpy as np
 import psutil
 import pytest
+from joblib.parallel import ThreadingBackend
 from threadpoolctl import threadpool_info
 
+import ep2sindy as ep
 from ep2sindy.runtime import parallel
-from ep2sindy.runtime.parallel import Loky, Serial, Workers, collect, rows_in_order, run_alike
+from ep2sindy.runtime.parallel import SURROUNDING, Loky, Serial, Workers, collect, rows_in_order
 from ep2sindy.runtime.progress import as_progress
+from tests.test_pointwise import parabolas, searching
 
 PATIENCE_S = 300.0  # for what comes at once on an idle machine: only what hangs is longer
 PIECES = [np.arange(k, dtype=np.float64) for k in range(7)]
@@ -33,7 +38,7 @@ class Backwards(Serial):
     """Results come in the order that is farthest from that of the pieces."""
 
     def run(
-        self, function: Callable[[Any], Any], pieces: Iterable[Any]
+        self, function: Callable[[Any], Any], pieces: Iterable[Any], n_alike: int | None = None
     ) -> Iterator[tuple[int, Any]]:
         return reversed(list(super().run(function, pieces)))
 
@@ -114,11 +119,56 @@ def test_pieces_that_are_alike_leave_this_process_only_where_it_pays(
 ) -> None:
     for start_s, leave in ((-1.0, True), (np.inf, False)):
         monkeypatch.setattr(parallel, "START_S", start_s)
-        found = dict(run_alike(Loky(n_jobs=2), process_of, [5, 6, 7], 3))
+        found = dict(Loky(n_jobs=2).run(process_of, [5, 6, 7], n_alike=3))
         assert [found[k][0] for k in range(3)] == [5, 6, 7]
         assert found[0][1] == os.getpid()
         assert all((found[k][1] != os.getpid()) == leave for k in (1, 2))
-    assert not list(run_alike(Loky(n_jobs=2), process_of, [], 0))
+    assert not list(Loky(n_jobs=2).run(process_of, [], n_alike=0))
+
+
+@pytest.mark.parametrize("workers", [SURROUNDING, Loky(n_jobs=2)])
+def test_a_surrounding_config_of_joblib_says_where_pieces_go(workers: Workers) -> None:
+    with joblib.parallel_config("threading", n_jobs=2):
+        found = dict(workers.run(process_of, [5, 6, 7], n_alike=3))
+    assert found == {k: (5 + k, os.getpid()) for k in range(3)}
+
+
+def test_what_is_given_no_workers_follows_the_config_of_joblib() -> None:
+    """Blocks of a field, and operating points."""
+    where = Recorded()
+    joblib.register_parallel_backend("recorded", lambda: where)
+    runs = [ep.lotka_volterra(a=a).trajectory() for a in (0.5, 0.8)]
+    points = [replace(run, parameters={"a": k}) for k, run in enumerate(runs)]
+    with joblib.parallel_config("recorded", n_jobs=2):
+        ep.pointwise(parabolas(), searching(), block_points=3)
+        n_blocks = where.n_submitted
+        ep.discover(points, method=ep.Regression())
+    assert (n_blocks, where.n_submitted) == (4, 6)
+    ep.pointwise(parabolas(), searching(), block_points=3)
+    assert where.n_submitted == 6
+
+
+class Recorded(ThreadingBackend):
+    """Threads that count the pieces which they are given."""
+
+    n_submitted = 0
+
+    def submit(self, func: Any, callback: Any = None) -> Any:
+        self.n_submitted += 1
+        return super().submit(func, callback)
+
+
+@pytest.mark.parametrize("part", [[0, 2], [3, 2], [1], [1.0, 2], "12", [True, 2]])
+def test_a_part_is_one_of_n(part: Any) -> None:
+    with pytest.raises(ValueError, match=r"part must be \[k, n\], the k-th of n parts"):
+        Serial(part=part)
+
+
+def test_a_part_needs_pieces_that_are_kept() -> None:
+    with pytest.raises(ValueError, match=r"got part=\[1, 2\] where none are kept"):
+        collect(Serial(part=[1, 2]), total, PIECES, nullcontext(lambda n: None))
+    with pytest.raises(ValueError, match=r"got part=\[2, 2\] where none are kept"):
+        ep.pointwise(parabolas(), searching(), workers=Loky(part=[2, 2]))
 
 
 WITHIN = """

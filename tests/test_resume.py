@@ -1,7 +1,6 @@
 """Interrupted runs continue with their finished pieces, and find the same to the last bit."""
 
 import os
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +10,8 @@ import pytest
 from omegaconf import DictConfig
 
 import ep2sindy as ep
-from ep2sindy.runtime import parallel
-from ep2sindy.runtime.parallel import CachedWorkers, Loky, Serial
+from ep2sindy.runtime.kept_pieces import CachedWorkers, KeptPieces, PartDone
+from ep2sindy.runtime.parallel import Loky, Serial
 from ep2sindy.runtime.user_cache import cache_folder
 from ep2sindy.studies import benchmark, trace
 from tests.programs import Computed, composed, computed
@@ -49,6 +48,35 @@ def test_pieces_are_computed_once_over_all_calls(tmp_path: Path) -> None:
     squares_and_negatives(CachedWorkers(Serial(), tmp_path / "b"), done)
     squares_and_negatives(CachedWorkers(Serial(), None), done)
     assert len(done) == 10
+
+
+@pytest.mark.parametrize("order", [[1, 2, 3], [3, 1, 2]])
+def test_the_last_part_continues_with_the_pieces_of_all(tmp_path: Path, order: list[int]) -> None:
+    done: list[int] = []
+
+    def run(part: list[int] | None) -> list[list[tuple[int, int]]]:
+        def square(n: int) -> int:
+            done.append(n)
+            return n * n
+
+        workers = CachedWorkers(Serial(part), tmp_path)
+        return [sorted(workers.run(square, numbers)) for numbers in (range(8), range(2))]
+
+    for k in order[:2]:
+        with pytest.raises(PartDone, match=rf"part {k} of 3 is done.* pieces of other parts"):
+            run([k, 3])
+        assert done == [*range(k - 1, 8, 3)]
+        done.clear()
+    whole = [[(n, n * n) for n in range(8)], [(0, 0), (1, 1)]]
+    assert run([order[2], 3]) == whole
+    assert done == [*range(order[2] - 1, 8, 3), 0, 1]
+    assert run(None) == run([1, 3]) == whole
+    assert len(done) == len([*range(order[2] - 1, 8, 3)]) + 2
+
+
+def test_parts_without_a_folder_are_refused() -> None:
+    with pytest.raises(ValueError, match="where none are kept: set parallel.part"):
+        list(CachedWorkers(Serial([1, 2]), None).run(abs, [1]))
 
 
 def test_workers_in_other_processes_share_the_pieces(tmp_path: Path) -> None:
@@ -89,31 +117,28 @@ def broken_and_resumed(
     monkeypatch: pytest.MonkeyPatch, config: DictConfig, *, after: int
 ) -> Computed:
     """A run that ends after some pieces, as by Ctrl-C, and continues: those are not done again."""
-    read_or_do, begun = parallel.kept, list[Any]()
+    write, written = KeptPieces.write, list[tuple[int, int]]()
 
-    def last(folder: Path, piece: tuple[int, int], function: Callable, value: Any) -> Any:
-        if len(begun) == after:
+    def last(kept: KeptPieces, number: int, result: Any) -> None:
+        if len(written) == after:
             raise KeyboardInterrupt
-        begun.append(piece)
-        return read_or_do(folder, piece, function, value)
+        written.append((kept.call, number))
+        write(kept, number, result)
 
-    def others(folder: Path, piece: tuple[int, int], function: Callable, value: Any) -> Any:
-        def new(value: Any) -> Any:
-            assert piece not in begun
-            return function(value)
+    def others(kept: KeptPieces, number: int, result: Any) -> None:
+        assert (kept.call, number) not in written
+        write(kept, number, result)
 
-        return read_or_do(folder, piece, new, value)
-
-    monkeypatch.setattr(parallel, "kept", last)
+    monkeypatch.setattr(KeptPieces, "write", last)
     with pytest.raises(KeyboardInterrupt):
         computed(config)
-    monkeypatch.setattr(parallel, "kept", others)
+    monkeypatch.setattr(KeptPieces, "write", others)
     return computed(config)
 
 
 def check_same(whole: Computed, rest: Computed) -> None:
     times = ["cpu_s", "cpu_s_per_search"]
-    assert "going on with the pieces that a broken run had finished" in rest.log
+    assert "going on with the pieces that an earlier run has kept" in rest.log
     assert "going on with" not in whole.log
     for name, table in whole.report.tables.items():
         pair = table, rest.report.tables[name]

@@ -23,6 +23,7 @@ from ep2sindy.report.report import Report
 from ep2sindy.report.screen import Screen
 from ep2sindy.report.tensorboard import Board
 from ep2sindy.runtime.files import write_text
+from ep2sindy.runtime.kept_pieces import PartDone
 from ep2sindy.runtime.progress import Bars
 from ep2sindy.studies.study import Experiment
 from ep2sindy.trust.user_code import load_user_module
@@ -39,7 +40,11 @@ def run_config(config: DictConfig) -> Path:
         advance(1)
     precompile()
     with start_run(config) as report:
-        study.run(report)
+        try:
+            study.run(report)
+        except PartDone as done:
+            report.say(str(done))
+            return report.folder.path
         formats = config.get("formats", ["png"])
         report.finish(purpose=purpose_of(kind), keys=keys_of(kind), formats=formats)
     return report.folder.path

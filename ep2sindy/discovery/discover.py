@@ -18,7 +18,7 @@ from ep2sindy.discovery.result import Discovery, DiscoveryMethod, join_points
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.operating.law import LawFunctions
 from ep2sindy.operating.records import group_by_point, most_central, values_of
-from ep2sindy.runtime.parallel import Serial, Workers, collect
+from ep2sindy.runtime.parallel import SURROUNDING, Workers, collect
 from ep2sindy.runtime.progress import SILENT, Progress, as_progress
 from ep2sindy.runtime.threads import one_thread
 from ep2sindy.runtime.values import check_count, check_kind
@@ -84,7 +84,8 @@ def discover(
     seed : int or Generator, default 0
         Of all random choices, such as splits and bootstraps.
     workers : Workers, optional
-        How operating points are computed: in this process, or in parallel (`ep.parallel`).
+        How operating points are computed (`ep.parallel`). By default as a surrounding
+        `joblib.parallel_config` says, and one after the other without it.
     progress : Progress or bool, default False
         True shows progress bars.
 
@@ -140,7 +141,7 @@ def discover(
     elif all(run.parameters == task.runs[0].parameters for run in task.runs):
         found = _discover_point((task, rng), method=method, progress=watch)
     else:
-        found = _discover_apart(task, method, workers or Serial(), rng, watch)
+        found = _discover_apart(task, method, workers or SURROUNDING, rng, watch)
     return replace(found, data_warnings=(*found.data_warnings, *averaged))
 
 

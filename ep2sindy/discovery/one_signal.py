@@ -32,7 +32,7 @@ from ep2sindy.library.names import number_text
 from ep2sindy.library.relations import relations_of
 from ep2sindy.model.comparison import SPIRALS
 from ep2sindy.regression.searches import BestSubset
-from ep2sindy.runtime.parallel import Once, at_once
+from ep2sindy.runtime.kept_pieces import Once, at_once
 from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.signals.embedding import HARMONICS, Embedded, Embedding, embed, unexplained
 from ep2sindy.signals.signal import Signal, is_positive

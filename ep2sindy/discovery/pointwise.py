@@ -26,7 +26,7 @@ from ep2sindy.library.units import unit_product
 from ep2sindy.model.scores import r2
 from ep2sindy.regression.constrained import fit_draws
 from ep2sindy.regression.front import Candidate
-from ep2sindy.runtime.parallel import Workers, run_alike
+from ep2sindy.runtime.parallel import SURROUNDING, Workers, refuse_part
 from ep2sindy.runtime.progress import Advance, Progress, as_progress
 from ep2sindy.runtime.values import check_count, check_kind, check_list
 
@@ -122,7 +122,7 @@ def pointwise(
     field: xr.Dataset,
     search: PointSearch,
     *,
-    workers: Workers,
+    workers: Workers | None = None,
     block_points: int = 256,
     progress: Progress | Advance | bool = False,
 ) -> xr.Dataset:
@@ -136,8 +136,9 @@ def pointwise(
         Field over time and z, r or both, in SI.
     search : PointSearch
         States, library and method, the same at every point.
-    workers : Workers
-        How the blocks are computed, such as `ep.parallel.Serial()` or `ep.parallel.Loky()`.
+    workers : Workers, optional
+        How the blocks are computed, such as `ep.parallel.Loky()`. By default as a surrounding
+        `joblib.parallel_config` says, and one after the other without it.
     block_points : int, default 256
         Number of points in a block.
     progress : Progress, callable or bool, default False
@@ -166,19 +167,21 @@ def pointwise(
     >>> method = ep.Regression(ep.Differential(), bootstraps=ep.Bootstraps(4, n_culled=0))
     >>> library = ep.polynomial(["n_i", "n_n"], degree=1)
     >>> search = ep.discovery.PointSearch(["n_i", "n_n"], library, method)
-    >>> found = ep.pointwise(field.isel(z=[2], r=[2]), search, workers=ep.parallel.Serial())
+    >>> found = ep.pointwise(field.isel(z=[2], r=[2]), search)
     >>> found["coef"].sizes["term"], found["status"].values.tolist()
     (3, [[0]])
     """
     _check(field, search)
     part = field[list(search.variables)]
-    blocks = blocks_of(part, block_points)
+    blocks, search_block = blocks_of(part, block_points), partial(_search_block, search)
     result = _empty(part, search)
     pieces = (part.isel(block) for block in blocks)  # once read, none is held
+    workers = workers or SURROUNDING
+    refuse_part(workers.part)
     with as_progress(progress).stage(result["status"].size, "point") as advance:
-        for k, done in run_alike(workers, partial(_search_block, search), pieces, len(blocks)):
-            _place(result, blocks[k], done)
-            advance(done["status"].size)
+        for k, found in workers.run(search_block, pieces, n_alike=len(blocks)):
+            _place(result, blocks[k], found)
+            advance(found["status"].size)
     if not (result["status"] == 0).any():
         raise ValueError(f"no point could be fitted: {_why_none(result)}")
     return result

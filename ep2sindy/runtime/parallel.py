@@ -1,4 +1,7 @@
-"""Execution of independent pieces of work: one after the other, or on all cores."""
+"""Execution of independent pieces of work: one after the other, on all cores, or by joblib.
+
+Clusters (`clusters.py`) are backends of joblib, too: they differ in what they connect to.
+"""
 
 from __future__ import annotations
 
@@ -7,16 +10,16 @@ import pickle
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
-from itertools import count, islice
-from pathlib import Path
+from itertools import islice
 from threading import RLock
 from time import perf_counter
 from typing import Any, Protocol, TypeAlias, runtime_checkable
 
 import cloudpickle
-from joblib import Memory, Parallel, delayed, effective_n_jobs
+from joblib import Parallel, delayed, effective_n_jobs
+from joblib.parallel import BACKENDS, get_active_backend
 
 from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.runtime.threads import one_thread
@@ -29,6 +32,7 @@ START_S = 4.5
 Function: TypeAlias = Callable[[Any], Any]  # of a piece
 Numbered: TypeAlias = tuple[int, Any]  # the number of a piece, and the piece or its result
 Results: TypeAlias = Iterator[Numbered]
+Part: TypeAlias = Sequence[int]  # k and n: the k-th of n parts
 
 
 @runtime_checkable
@@ -37,10 +41,36 @@ class Workers(Protocol):
 
     `run` yields (number of the piece, result) as results arrive, in any order. Each piece runs on
     one thread, so that a result does not depend on where it was computed. Function, pieces and
-    results must be picklable.
+    results must be picklable. n_alike: number of pieces if each takes about as long; workers that
+    must be started first then save themselves if that takes longer. part: see `Loky`; `run` leaves
+    it to `CachedWorkers`.
     """
 
-    def run(self, function: Function, pieces: Iterable[Any]) -> Results: ...
+    @property
+    def part(self) -> Part | None: ...
+
+    def run(
+        self, function: Function, pieces: Iterable[Any], n_alike: int | None = None
+    ) -> Results: ...
+
+
+def check_part(part: Part | None) -> None:
+    """Raise ValueError unless a part is None or [k, n] with 1 <= k <= n."""
+    if part is None:
+        return
+    whole = isinstance(part, list | tuple) and all(type(number) is int for number in part)
+    if not (whole and len(part) == 2 and 1 <= part[0] <= part[1]):
+        raise ValueError(f"part must be [k, n], the k-th of n parts, such as [1, 4], got {part!r}")
+
+
+def refuse_part(part: Part | None) -> None:
+    """Raise ValueError for a part where no pieces are kept, which are what joins the parts."""
+    if part is not None:
+        raise ValueError(
+            "parts are joined by the pieces that a study keeps for the others, got part="
+            f"{[*part]} where none are kept: set parallel.part in +exp=pointwise, parametric, "
+            "predict or benchmark, with keep=true"
+        )
 
 
 def _on_one_thread(function: Function, numbered: Numbered) -> Numbered:
@@ -63,6 +93,7 @@ def collect(
     stage: a stage of a `Progress`, which receives the size of every finished piece. tell: called
     with the number and the result of every piece as soon as it is done.
     """
+    refuse_part(workers.part)
     results: dict[int, Any] = {}
     with stage as advance:
         for number, result in workers.run(function, pieces):
@@ -93,10 +124,14 @@ def rows_in_order(
     return [row for rows in found for row in rows]
 
 
-def _in_worker(code: bytes, parent: int, numbered: Numbered) -> Numbered:
-    from tqdm import tqdm
+def _in_worker(code: bytes, parent: int | None, numbered: Numbered) -> Numbered:
+    """Result of a piece. parent: the program whose end is the worker's; None for any other worker.
 
-    if os.getpid() != parent:  # inside a worker, joblib runs nested work in the same process
+    Workers of a cluster, for example, have been started by somebody else and serve other programs.
+    """
+    if parent not in (None, os.getpid()):  # joblib runs a worker's nested work in its process
+        from tqdm import tqdm
+
         end_with(parent)
         tqdm.set_lock(RLock())  # the default, a semaphore, causes a warning when the worker ends
     return _on_one_thread(pickle.loads(code), numbered)
@@ -109,11 +144,47 @@ def _with_its_code(function: Function) -> bytes:
     return cloudpickle.dumps(function)
 
 
+def is_local() -> bool:
+    """Whether joblib starts its own processes here, unless a `joblib.parallel_config` says else."""
+    return isinstance(get_active_backend()[0], BACKENDS["loky"])
+
+
+def run_in_joblib(function: Function, pieces: Iterable[Any], *, n_jobs: int | None) -> Results:
+    """Results of pieces, by the backend of joblib that is active at the call."""
+    # Workers without work end after a while; joblib starts others when work comes again, with this
+    # warning, and no piece is lost.
+    warnings.filterwarnings("ignore", "A worker stopped while some jobs", UserWarning)
+    # Ray's backend returns all results at once. max_nbytes=None, or joblib keeps a copy of every
+    # large array on disk.
+    as_they_come = get_active_backend()[0].supports_return_generator
+    kind = "generator_unordered" if as_they_come else "list"
+    workers = Parallel(n_jobs=n_jobs, return_as=kind, max_nbytes=None)
+    parent = os.getpid() if is_local() else None
+    code, numbered = _with_its_code(function), enumerate(pieces)
+    return iter(workers(delayed(_in_worker)(code, parent, each) for each in numbered))
+
+
 @dataclass(frozen=True)
 class Serial:
-    """Workers that compute one part after the other, in this process."""
+    """Workers that compute one part after the other, in this process.
 
-    def run(self, function: Function, pieces: Iterable[Any]) -> Results:
+    Parameters
+    ----------
+    part : (k, n), optional
+        See `Loky`.
+
+    Raises
+    ------
+    ValueError
+        If the part is not one of n.
+    """
+
+    part: Part | None = None
+
+    def __post_init__(self) -> None:
+        check_part(self.part)
+
+    def run(self, function: Function, pieces: Iterable[Any], n_alike: int | None = None) -> Results:
         for numbered in enumerate(pieces):
             yield _on_one_thread(function, numbered)
 
@@ -123,110 +194,50 @@ ONE_BY_ONE = Serial()
 
 @dataclass(frozen=True)
 class Loky:
-    """Workers in parallel processes on this machine.
+    """Workers in parallel processes on this machine, or of the active backend of joblib.
+
+    A surrounding `joblib.parallel_config` is respected: `with joblib.parallel_config("dask")` sends
+    the pieces to the workers of a dask client.
 
     Parameters
     ----------
-    n_jobs : int, default -1
-        Number of processes. -1 means one per core.
+    n_jobs : int or None, default -1
+        Number of processes. -1 means one per core; None takes the number of the surrounding
+        `joblib.parallel_config`, and one without it.
+    part : (k, n), optional
+        Only the k-th of n parts of the first set of pieces is computed, and kept for the others, as
+        by one job of an array of n. The part that finds all others kept continues with all pieces,
+        as does a run without a part. Only studies that keep pieces take parts.
 
     Raises
     ------
     ValueError
-        If the number is zero or not whole.
+        If the number is zero or not whole, or the part is not one of n.
     """
 
-    n_jobs: int = -1
+    n_jobs: int | None = -1
+    part: Part | None = None
 
     def __post_init__(self) -> None:
-        if type(self.n_jobs) is not int or self.n_jobs == 0:
+        if self.n_jobs is not None and (type(self.n_jobs) is not int or self.n_jobs == 0):
             raise ValueError(
                 f"n_jobs must be a number of processes, or -1 for one per core, got {self.n_jobs!r}"
             )
+        check_part(self.part)
 
-    def run(self, function: Function, pieces: Iterable[Any]) -> Results:
-        if effective_n_jobs(self.n_jobs) == 1:
-            yield from ONE_BY_ONE.run(function, pieces)
-            return
-        # Workers without work end after a while; joblib starts others when work comes again, with
-        # this warning, and no piece is lost.
-        warnings.filterwarnings("ignore", "A worker stopped while some jobs", UserWarning)
-        # max_nbytes=None, or joblib would keep a copy of every large array on disk.
-        workers = Parallel(n_jobs=self.n_jobs, return_as="generator_unordered", max_nbytes=None)
-        code, numbered = _with_its_code(function), enumerate(pieces)
-        yield from workers(delayed(_in_worker)(code, os.getpid(), each) for each in numbered)
-
-
-Once = Callable[[Callable[[], Any]], Any]  # does a piece of work, or reads its result back
-
-
-def at_once(function: Callable[[], Any]) -> Any:
-    """Do a piece of work, and keep nothing."""
-    return function()
+    def run(self, function: Function, pieces: Iterable[Any], n_alike: int | None = None) -> Results:
+        waiting, n_first, pays = iter(pieces), 0, True
+        if is_local():
+            saved = 1.0 - 1.0 / effective_n_jobs(self.n_jobs)  # as a fraction of the time of all
+            pays = saved > 0.0
+            if pays and n_alike is not None:
+                n_first, begin = 1, perf_counter()
+                yield from ONE_BY_ONE.run(function, islice(waiting, n_first))
+                pays = saved * (perf_counter() - begin) * (n_alike - 1) > START_S
+        run = partial(run_in_joblib, n_jobs=self.n_jobs) if pays else ONE_BY_ONE.run
+        for number, result in run(function, waiting):
+            yield number + n_first, result
 
 
-@dataclass(frozen=True, eq=False)
-class CachedWorkers:
-    """Workers whose finished pieces are kept in a folder, and read back by a run that continues.
-
-    A piece is named by the number of the call of `run` that it belongs to, and by its own: the
-    calls must come in the same order in every run of the same settings. folder: None keeps nothing.
-    """
-
-    workers: Workers
-    folder: Path | None
-    _calls: Iterator[int] = field(default_factory=count)
-
-    def run(self, function: Function, pieces: Iterable[Any]) -> Results:
-        return self.workers.run(self.keeping(function), enumerate(pieces))
-
-    def once(self, function: Callable[[], Any]) -> Any:
-        """The result of one piece of work that is done in this process."""
-        return self.keeping(lambda _: function())((0, None))
-
-    def keeping(self, function: Function) -> Callable[[Numbered], Any]:
-        """The function of numbered pieces that does each, or reads its result back."""
-        return partial(_kept_piece, self.folder, next(self._calls), function)
-
-
-def _kept_piece(folder: Path | None, call: int, function: Function, numbered: Numbered) -> Any:
-    number, piece = numbered
-    return kept(folder, (call, number), function, piece) if folder else function(piece)
-
-
-def kept(folder: Path, piece: tuple[int, int], function: Function, value: Any) -> Any:
-    """`function(value)`, or what it returned when this piece was done before.
-
-    piece: numbers of the piece's call and of the piece in it.
-    """
-    return Memory(folder, verbose=0).cache(_done, ignore=["function", "value"])(
-        piece, function, value
-    )
-
-
-def _done(piece: tuple[int, int], function: Function, value: Any) -> Any:
-    return function(value)
-
-
-def run_alike(
-    workers: Workers, function: Function, pieces: Iterable[Any], n_pieces: int
-) -> Results:
-    """Run pieces of which each takes about as long; processes start only if they save time.
-
-    The first piece is then done in this process, and the others too if they would take less time
-    than the start of the processes.
-    """
-    if isinstance(workers, CachedWorkers):
-        kept = workers.keeping(function)
-        yield from run_alike(workers.workers, kept, enumerate(pieces), n_pieces)
-        return
-    waiting = iter(pieces)
-    n_first = 1 if isinstance(workers, Loky) else 0
-    begin = perf_counter()
-    yield from ONE_BY_ONE.run(function, islice(waiting, n_first))
-    if isinstance(workers, Loky):
-        rest_s = (perf_counter() - begin) * (n_pieces - 1)
-        saved_s = rest_s * (1.0 - 1.0 / effective_n_jobs(workers.n_jobs))
-        workers = workers if saved_s > START_S else ONE_BY_ONE
-    for number, result in workers.run(function, waiting):
-        yield number + n_first, result
+# The workers of functions that are given none.
+SURROUNDING = Loky(n_jobs=None)

@@ -15,7 +15,8 @@ from ep2sindy.data.run_files import FilePattern
 from ep2sindy.data.steps import files_of
 from ep2sindy.report.report import Report
 from ep2sindy.runtime.files import fingerprint
-from ep2sindy.runtime.parallel import ONE_BY_ONE, CachedWorkers, Workers
+from ep2sindy.runtime.kept_pieces import CachedWorkers
+from ep2sindy.runtime.parallel import ONE_BY_ONE, Workers
 from ep2sindy.runtime.user_cache import cache_folder
 from ep2sindy.trust.user_code import PACKAGE, nodes_of, own_source
 
@@ -79,7 +80,8 @@ def resumed(
 ) -> Iterator[CachedWorkers]:
     """Workers that continue with the pieces that an interrupted run left in the user's cache.
 
-    keep: False begins anew and keeps nothing. aside: see `pieces_key`.
+    keep: False begins anew and keeps nothing, so that workers with a part are refused. aside: see
+    `pieces_key`.
     The pieces are removed once the run has written all that it found.
     """
     folder = None
@@ -89,7 +91,7 @@ def resumed(
         except OSError as error:
             report.say(f"finished pieces are not kept: {error}")
     if folder is not None and folder.exists():
-        report.say("going on with the pieces that a broken run had finished")
+        report.say("going on with the pieces that an earlier run has kept")
     try:
         yield CachedWorkers(workers, folder)
     except KeyboardInterrupt:

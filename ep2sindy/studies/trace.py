@@ -39,7 +39,7 @@ from ep2sindy.model.comparison import Status
 from ep2sindy.report.document import Text
 from ep2sindy.report.report import Report
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View, percent
-from ep2sindy.runtime.parallel import Once
+from ep2sindy.runtime.kept_pieces import Once
 from ep2sindy.signals.driving import add_drive, ask_whether_driven, report_unknown_drive
 from ep2sindy.signals.signal import Signal, prepare_signal
 from ep2sindy.studies.candidates import add_candidates, add_estimate
