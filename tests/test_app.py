@@ -1,5 +1,6 @@
 """From a command line to a study: configs, their errors, and sweeps."""
 
+import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -205,6 +206,25 @@ def test_a_sweep_goes_on_after_a_failed_job_and_says_so(
     errors = [read_json(path.read_text())["error"] for path in paths]
     assert errors[0] == "seed must be a whole number, zero or more: got -1"
     assert errors[1].startswith("no such file: ")
+
+
+@pytest.mark.parametrize(
+    ("launcher", "message"),
+    [
+        ("slurm", "error: the launcher must be able to run the jobs, got: Could not detect"),
+        pytest.param("submitit_local", "error: 2 jobs failed", marks=pytest.mark.slow),
+    ],
+)
+def test_a_launcher_that_fails_and_jobs_that_fail_elsewhere_are_said(
+    launcher: str, message: str, here: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture,
+) -> None:  # fmt: skip
+    monkeypatch.setattr(shutil, "which", lambda *_: None)  # as on a machine without SLURM
+    error = ended("-m", "+exp=weak", f"hydra/launcher={launcher}", "seed=-1,-2")
+    assert error.startswith(message)
+    assert ("job 1 failed: seed must be a whole" in capsys.readouterr().out) == (
+        launcher != "slurm"
+    )
 
 
 @pytest.mark.parametrize(

@@ -21,13 +21,14 @@ import hydra
 from hydra import compose, initialize_config_dir
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
+from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from ep2sindy.app.arguments import COMMANDS, JOBS, explain, options_first
-from ep2sindy.runtime.files import write_json
+from ep2sindy.runtime.files import read_json, write_json
 from ep2sindy.runtime.screen import listed, near_words, plain, say
 from ep2sindy.runtime.threads import start_on_one_thread
 from ep2sindy.trust.interruption import end_as_interrupted
@@ -101,14 +102,13 @@ def run(conf: Path) -> list[str]:
     if "--config-dir" not in options and own.is_dir() and own.resolve() != conf.resolve():
         options += ["--config-dir", str(own)]
     sys.argv[1:] = [*options, *settings]
-    sweeps: list[Path] = []
-    errors: list[str] = []  # Hydra too would report an error that left a job
+    jobs: list[list[str]] = []  # their errors; Hydra too would report an error that left a job
+    HydraConfig.instance().cfg = None
 
     @hydra.main(config_path=str(conf), config_name="config", version_base="1.3")
     def job(config: DictConfig) -> None:
-        if HydraConfig.get().mode == RunMode.MULTIRUN:
-            sweeps[:] = [Path(HydraConfig.get().sweep.dir)]
-        errors.extend(run_job(config, conf))
+        jobs.append([])
+        jobs[-1] += run_job(config, conf)
 
     def composed(settings: list[str]) -> DictConfig:
         folders = (
@@ -122,10 +122,45 @@ def run(conf: Path) -> list[str]:
         job()
     except HydraException as error:
         raise ValueError(explain(error, settings, composed)) from error
+    except RuntimeError as error:
+        if jobs:
+            raise
+        raise ValueError(
+            f"the launcher must be able to run the jobs, got: {error}; hydra/launcher=slurm needs "
+            "SLURM, and hydra/launcher=submitit_local runs the same jobs on this machine"
+        ) from error
     finally:
-        for sweep in sweeps:
+        sweep = sweep_folder()
+        if sweep is not None and any(sweep.glob(f"{JOBS}/*.json")):
             say(f"the jobs side by side: ep2sindy compare {quote(str(sweep))}")
-    return errors
+    if sweep is None or jobs:
+        return [error for errors in jobs for error in errors]
+    return job_errors(sweep)
+
+
+class KnownSweep(Callback):
+    """Makes Hydra's settings of a sweep known to this process also if others run its jobs."""
+
+    def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
+        HydraConfig.instance().set_config(config)
+
+
+def sweep_folder() -> Path | None:
+    """The folder of the sweep that this process has begun; None if it has begun no sweep."""
+    if not HydraConfig.initialized() or HydraConfig.get().mode != RunMode.MULTIRUN:
+        return None
+    return Path(HydraConfig.get().sweep.dir)
+
+
+def job_errors(sweep: Path) -> list[str]:
+    """Print and return the errors in the records of jobs that ran in other processes."""
+    records = {
+        path.stem: read_json(path.read_text("utf-8")) for path in sweep.glob(f"{JOBS}/*.json")
+    }
+    errors = {job: record["error"] for job, record in records.items() if "error" in record}
+    for job, error in errors.items():
+        say(f"job {job} failed: {error}")
+    return list(errors.values())
 
 
 def run_job(config: DictConfig, conf: Path) -> list[str]:
