@@ -64,10 +64,8 @@ docs-numbers: .venv/installed
 benchmark: .venv/installed
 	$(BIN)/python -m benchmarks.startup
 	$(BIN)/python -m benchmarks.search
-	$(BIN)/python -m benchmarks.simulator
 	$(BIN)/python -m benchmarks.simulator_2d
 	$(BIN)/python -m benchmarks.source
-	$(BIN)/python -m benchmarks.free_runs
 	$(BIN)/python -m benchmarks.hallthruster
 	$(BIN)/python -m benchmarks.refine
 	$(BIN)/python -m benchmarks.many_states

@@ -1,32 +1,23 @@
 """How often the joint estimator finds known equations, in noise, and its reports of a lack of fit.
 
     python -m benchmarks.estimation counts [--n 100] [--systems ...] [--noises ...] [--kind white]
-    python -m benchmarks.estimation lack of fit [--n 25]     # with each true term left out
-    python -m benchmarks.estimation short [--n 10]      # short and sparse records of Lorenz
-    python -m benchmarks.estimation degrees [--n 10]    # a library too small; delays at 20 % noise
-    python -m benchmarks.estimation samples             # CPU against the number of samples
-    python -m benchmarks.estimation waves [--sizes 5 8 12 20 40] [--n 3]  # Lorenz-96 of many states
+    python -m benchmarks.estimation lack_of_fit [--n 25]  # with each true term left out
+    python -m benchmarks.estimation short [--n 10]        # short and sparse records of Lorenz
+    python -m benchmarks.estimation degrees [--n 10]      # a library that is too small
+    python -m benchmarks.estimation samples               # CPU against the number of samples
+    python -m benchmarks.estimation waves [--sizes 5 8 12 20 40] [--n 3]  # Lorenz-96
     python -m benchmarks.estimation chain [--sizes 20] [--n 3]            # coupled van der Pol's
-    python -m benchmarks.estimation thruster            # the breathing mode, next to free runs
-    python -m benchmarks.estimation collection [--n 3] [--noises ...]  # dysts: classes of failure
-    python -m benchmarks.estimation courses --n 3 --noises 0.05        # inputs between samples
-    python -m benchmarks.estimation penalties [--n 1] [--noises ...]      # dysts: penalty of a term
+    python -m benchmarks.estimation thruster              # the breathing mode, next to free runs
+    python -m benchmarks.estimation penalties [--n 1] [--noises ...]      # dysts
 
 `counts` prints per system and noise: selected exactly right, wrong ones that are reported as a lack
 of fit, right ones that are, median CPU-s and the longest; of the right ones the median relative
 error of a coefficient and the fraction of 95 % intervals that hold the truth.
 
 `short` prints for each kind of record: selected right, wrong and reported as a lack of fit, wrong
-and stated that the samples do not tell, wrong without a word, and the largest RMS miss of the
-model's own steps, in noise, of those that are no lack_of_fit: a path that misses them is no
-trajectory of the model.
-
-`collection` prints, for every draw of all systems of dysts, how many are exactly right, CPU-s, the
-intervals, and each wrong one in the first class of these that holds: flagged (called a
-lack_of_fit); search (the truth is likelier by more than 4, penalties included); near (the truth of
-every wrong equation is among the rivals at better than 1:20); less likely (the truth is, by as much
-as printed: terms that are missed change -2 log likelihood by less than their penalty). `penalties`
-counts missed and false terms against the weight of the choice among terms in a term's penalty.
+and stated that the samples do not suffice, wrong without a word. `penalties` counts missed and
+false terms in all systems of dysts against the weight of the choice among terms in a term's
+penalty. Prints the tables of docs/estimation.md.
 """
 
 from __future__ import annotations
@@ -39,7 +30,6 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import product
-from typing import NamedTuple
 
 import numpy as np
 
@@ -51,9 +41,7 @@ from benchmarks.sustained import DOWNSTREAM, POINTS, parts, record
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.estimation import supports
 from ep2sindy.estimation.estimate import Estimate
-from ep2sindy.estimation.problem import scale_problem
-from ep2sindy.estimation.solver import from_smooth
-from ep2sindy.model.inputs import COURSES, curve_through
+from ep2sindy.selection.criteria import Selection
 from ep2sindy.studies.sustained import start_of
 from ep2sindy.systems.draws import DRAWS
 from ep2sindy.systems.systems import System, lorenz
@@ -104,45 +92,28 @@ def _line(rows: Sequence[dict[str, float]]) -> str:
     )
 
 
-ROUTES = {
-    "joint": ep.TrajectorySearch(),
-    "weighted rows": ep.Regression(ep.WeightedWeak()),
-    "differential rows": ep.Regression(ep.Differential(), ep.BestSubset()),
-}
-
-
 def lacks_of_fit(systems: Sequence[str], n: int) -> None:
-    """With a true term left out, and with the whole library where that is found."""
-    print(
-        f"called a lack_of_fit:  a term left out, by {', '.join(ROUTES)}; right equations, by all"
-    )
-    totals = np.zeros((2, len(ROUTES), 2), dtype=int)
-    holding = np.zeros((2, 2), dtype=int)  # (equation that is whole, that lacks the term)
+    """Reported lacks of fit with a true term left out, and of right models by the whole library."""
+    totals = np.zeros((2, 2), dtype=int)  # (left out, whole), (reported, of)
     for name in systems:
-        counts = np.zeros((2, len(ROUTES), 2), dtype=int)  # library, route, (called, of)
+        counts = np.zeros((2, 2), dtype=int)
         for number in range(n):
             system, run = noisy(name, 0.05, number)
             library, true = system.model.library, system.model.coef != 0.0
             left_out = np.random.default_rng(number).choice(np.flatnonzero(true.any(axis=1)))
-            for k, kept in enumerate(
-                (np.arange(len(library)) != left_out, np.full(len(library), True))
-            ):
-                for r, method in enumerate(ROUTES.values()):
-                    found = ep.discover(run, library.take(kept), method)
-                    if k == 0 and found.estimate is not None and found.lack_of_fit:
-                        for state, lacks in zip(run.state_names, true[left_out], strict=True):
-                            holding[int(lacks)] += state in found.estimate.explained_states, 1
-                    if k == 0 or ((found.model.coef != 0.0) == true).all():
-                        counts[k, r] += bool(found.lack_of_fit), 1
+            lacking = library.take(np.arange(len(library)) != left_out)
+            counts[0] += bool(ep.discover(run, lacking).lack_of_fit), 1
+            found = ep.discover(run, library)
+            if ((found.model.coef != 0.0) == true).all():
+                counts[1] += bool(found.lack_of_fit), 1
         totals += counts
         print(f"{name:16} {_fractions(counts)}", flush=True)
     print(f"{'all':16} {_fractions(totals)}")
-    (whole, n_whole), (lacking, n_lacking) = holding.tolist()
-    print(
-        f"equations by joint of models that do not fit, reported to hold: {whole} of {n_whole} "
-        "whole ones, "
-        f"{lacking} of {n_lacking} that lack the term"
-    )
+
+
+def _fractions(counts: np.ndarray) -> str:
+    (lacking, n_lacking), (whole, n_whole) = counts.tolist()
+    return f"a term left out {lacking}/{n_lacking}, right equations {whole}/{n_whole}"
 
 
 def chemical(
@@ -159,33 +130,17 @@ def chemical(
     return Trajectory(clean.t, states, clean.state_names)
 
 
-def _fractions(counts: np.ndarray) -> str:
-    return "  ".join(f"{called}/{of}" for called, of in counts.reshape(-1, 2))
-
-
 def short(n: int) -> None:
-    print(
-        "record                                right lack of fit open silent   largest miss, CPU-s"
-    )
+    print(f"{'record':32} right  lack of fit  open  silent")
     for words, make in SHORT.items():
-        rows, misses, cpu_s = Counter[str](), [0.0], 0.0
+        rows = Counter[str]()
         for number in range(n):
-            runs, start = make(number), time.process_time()
-            found = ep.estimate(runs, LORENZ.model.library)
-            cpu_s += time.process_time() - start
+            found = ep.estimate(make(number), LORENZ.model.library)
             right = bool(((found.model.coef != 0.0) == (LORENZ.model.coef != 0.0)).all())
-            stated = (
-                "lack_of_fit"
-                if found.lack_of_fit
-                else "open"
-                if found.too_few_samples
-                else "silent"
-            )
-            rows[f"right {stated}" if right else stated] += 1
-            misses += [] if found.lack_of_fit else [_largest_miss(found)]
-        right = sum(count for word, count in rows.items() if word.startswith("right"))
-        counts = f"{right:5d} {rows['lack_of_fit']:6d} {rows['open']:4d} {rows['silent']:6d}"
-        print(f"{words:38}{counts}   {max(misses):.1e}  {cpu_s:.0f}", flush=True)
+            wrong = "open" if found.too_few_samples else "silent"
+            rows["right" if right else "lack of fit" if found.lack_of_fit else wrong] += 1
+        counts = "  ".join(f"{rows[k]:5d}" for k in ("right", "lack of fit", "open", "silent"))
+        print(f"{words:32} {counts}", flush=True)
 
 
 def _lorenz_piece(number: int, n_samples: int, noise: float) -> ep.Trajectory:
@@ -210,38 +165,16 @@ SHORT: dict[str, Callable[[int], list[ep.Trajectory]]] = {
 }
 
 
-def _largest_miss(found: Estimate) -> float:
-    """RMS of what the model, run from each sample of its path, misses of the next, in noise."""
-    squares, n_steps, own = np.zeros(len(found.noise_std)), 0, found.model
-    for path, run in zip(found.paths, found.runs, strict=True):
-        for k in range(0, len(path) - 1, max(1, len(path) // 50)):
-            ends = own.simulate(run.t[k : k + 2], path[k]).states
-            squares += np.square((ends[-1] - path[k + 1]) / found.noise_std)
-            n_steps += 1
-    return float(np.sqrt(squares.max() / n_steps))
-
-
 def degrees(n: int) -> None:
-    """The Brusselator in libraries of degree 2 and 3; right models at 20 % noise called late."""
+    """The Brusselator in libraries of degree 2 and 3."""
     true = OTHERS["brusselator"].system("brusselator").model.coef != 0.0
-    for degree, align, kind in product((2, 3), (False, True), ("proportional", "white")):
-        library, counted = ep.polynomial(["x", "y"], degree=degree), np.zeros(3, dtype=int)
+    for degree, kind in product((2, 3), ("proportional", "white")):
+        library, right, lacks = ep.polynomial(["x", "y"], degree=degree), 0, 0
         for number in range(n):
-            found = ep.estimate([chemical(number, kind)], library, align=align)
-            right = degree == 3 and bool(((found.model.coef != 0.0) == true).all())
-            counted += right, bool(found.lack_of_fit), bool(found.delays_s.any())
-        print(
-            f"degree {degree} {align=} {kind:12} right, lack of fit, late: {counted} of {n}",
-            flush=True,
-        )
-    total = np.zeros(2, dtype=int)
-    for name in [*DRAWS, *OTHERS]:
-        for number in range(2 * n):
-            system, run = noisy(name, 0.2, number)
-            found = ep.estimate([run], system.model.library)
-            late, coef = bool(found.delays_s.any()), found.model.coef != 0.0
-            total += late, bool((coef == (system.model.coef != 0.0)).all())
-    print(f"20 % noise, {2 * n} draws of each system: {total[0]} called late, {total[1]} right")
+            found = ep.estimate([chemical(number, kind)], library)
+            right += degree == 3 and bool(((found.model.coef != 0.0) == true).all())
+            lacks += bool(found.lack_of_fit)
+        print(f"degree {degree} {kind:12} right {right}, lack of fit {lacks} of {n}", flush=True)
 
 
 def samples() -> None:
@@ -312,7 +245,8 @@ def thruster() -> None:
     """Six operating points: the estimator's own model, and what free runs choose of its fronts."""
     for label in POINTS:
         fitted, held = parts(record(label, DOWNSTREAM).run, "last")
-        for rule in (ep.discovery.Evidence(), ep.FreeRunScore()):
+        rules: tuple[Selection, ...] = (ep.discovery.Evidence(), ep.FreeRunScore())
+        for rule in rules:
             start = time.process_time()
             method = ep.TrajectorySearch(max_terms=4, selection=rule, depth=2)
             found = ep.discover(fitted, ep.polynomial(["n_i", "n_n"], degree=2), method)
@@ -320,75 +254,8 @@ def thruster() -> None:
             run = ep.evaluate(found.model, held, initial=start_of(held, found.model))
             print(
                 f"{label} {rule.label:9} {np.count_nonzero(found.model.coef)} terms, {run.text}; "
-                f"flow error {found.estimate.flow_error:g}, {cpu_s:.1f} CPU-s",
+                f"{cpu_s:.1f} CPU-s",
                 flush=True,
-            )
-
-
-class Judged(NamedTuple):
-    """One record of a collected system."""
-
-    name: str
-    missed: int
-    false: int
-    failure: str
-    cpu_s: float
-    inside: float
-
-
-def judged_draw(name: str, noise: float, number: int) -> Judged:
-    system, runs = collected_draw(name, noise, number)
-    start = time.process_time()
-    found = ep.estimate(runs, system.model.library)
-    cpu_s = time.process_time() - start
-    true, used = system.model.coef != 0.0, found.model.coef != 0.0
-    row = assessed(system, found, cpu_s)
-    failure = "" if row["right"] else _failure(system, runs, found)
-    missed, false = int((true & ~used).sum()), int((used & ~true).sum())
-    return Judged(name, missed, false, failure, cpu_s, row.get("inside", np.nan))
-
-
-def _failure(system: System, runs: Sequence[ep.Trajectory], found: Estimate) -> str:
-    """The class of a wrong model, see the module; with what the truth lacks in likelihood."""
-    if found.lack_of_fit:
-        return "flagged"
-    behind = _behind(system, runs, found)
-    if behind < -4.0:
-        return f"search ({behind:.0f})"
-    wrong = [
-        state
-        for state in system.model.states
-        if set(found.model.terms(state)) != set(system.model.terms(state))
-    ]
-    odds = {(r.state, frozenset(r.terms)): r.odds for r in found.rivals}
-    known = [odds.get((s, frozenset(system.model.terms(s))), 0.0) for s in wrong]
-    return "near" if min(known) > 0.05 else f"less likely ({behind:.0f})"
-
-
-def _behind(system: System, runs: Sequence[ep.Trajectory], found: Estimate) -> float:
-    """-2 log likelihood of the true terms minus that of those found, with the terms' penalties."""
-    problem = scale_problem(runs, system.model.library)
-    scores = []
-    for coef in (system.model.coef, found.model.coef):
-        part = problem.restricted((coef != 0.0)[problem.column, problem.equation])
-        part = replace(part, required=np.ones_like(part.required))
-        scores.append(from_smooth(part, None).score)
-    return scores[0] - scores[1]
-
-
-def collection(noises: Sequence[float], n: int) -> None:
-    for noise, number in product(noises, range(n)):
-        rows = [judged_draw(name, noise, number) for name in collected_names()]
-        cpu = [row.cpu_s for row in rows]
-        wrong = [row for row in rows if row.failure]
-        print(
-            f"noise {noise:g}, draw {number}: {len(rows) - len(wrong)} of {len(rows)} right; CPU-s "
-            f"median {np.median(cpu):.2f}, mean {np.mean(cpu):.2f}, most {max(cpu):.1f}; "
-            f"{100.0 * np.nanmean([row.inside for row in rows]):.1f} % of intervals hold"
-        )
-        for row in wrong:
-            print(
-                f"    {row.name}: {row.missed} missed, {row.false} false; {row.failure}", flush=True
             )
 
 
@@ -396,114 +263,41 @@ def penalties(noises: Sequence[float], n: int) -> None:
     print("weight  noise  right  missed terms  false terms")
     for noise, weight in product(noises, (0.0, 0.25, 0.5, 1.0, 1.5)):
         supports.GAMMA = weight
-        rows = [
-            judged_draw(name, noise, number)
-            for name, number in product(collected_names(), range(n))
-        ]
-        missed, false = sum(row.missed for row in rows), sum(row.false for row in rows)
-        right = sum(not row.failure for row in rows)
-        print(
-            f"{weight:6g}  {noise:5g}  {right}/{len(rows)}  {missed:12d}  {false:11d}", flush=True
-        )
-
-
-def set_record(model: ep.SparseModel, course: str, hold: int, noise: float, number: int):
-    """A record of 1000 samples, its input drawn anew every `hold` samples and on a course."""
-    rng = np.random.default_rng([number, hold, list(COURSES).index(course)])
-    k, knots = np.arange(1000), np.arange(0, 1000 + hold, hold)
-    t = {"x": 0.05, "th": 0.03}[model.states[0]] * k
-    levels = curve_through(knots.astype(float), rng.uniform(-1.0, 1.0, (len(knots), 1)), [course])
-    u = np.array([levels(float(each)) for each in k])
-    start = [0.3, 0.0][: len(model.states)]
-    path = replace(model, courses={"u": course}).simulate(t, start, u, rtol=1e-10).states
-    rms = np.sqrt(np.square(path).mean(axis=0))
-    return ep.Trajectory(
-        t, path + noise * rms * rng.standard_normal(path.shape), model.states, u, ["u"]
-    )
-
-
-def courses(noise: float, n: int) -> None:
-    """A first-order lag and a pendulum, driven by inputs on every course."""
-    lag = model_of({"x": {"x": -2.0, "u": 2.0}}, inputs=["u"])
-    swing = {"sin(th)": -9.0, "w": -0.3, "u": 4.0}
-    pendulum = model_of({"th": {"w": 1.0}, "w": swing}, inputs=["u"])
-    swings = ep.polynomial(["th", "w", "u"], degree=2, functions=["sin(th)"])
-    libraries = {"lag": (lag, ep.polynomial(["x", "u"], degree=3)), "pendulum": (pendulum, swings)}
-    print("right laws, with all 95 % intervals right, all intervals, lacks of fit, courses; CPU-s")
-    for (name, (model, library)), course, hold in product(libraries.items(), COURSES, (1, 20)):
-        rows, chosen = [], []
-        for number in range(n):
-            run, began = set_record(model, course, hold, noise, number), time.process_time()
-            found = ep.estimate([run], library)
-            cpu_s, held = time.process_time() - began, []
-            right = all(set(found.model.terms(s)) == set(model.terms(s)) for s in model.states)
-            if right and found.model.covariance is not None:
-                held = [
-                    low <= model.terms(s)[term] <= high
-                    for s in model.states
-                    for term, (low, high) in found.model.intervals(s).items()
-                ]
-            rows.append((right, bool(held) and all(held), sum(held), len(held), cpu_s))
-            chosen.append(
-                found.model.courses["u"] + (", a lack of fit" if found.lack_of_fit else "")
-            )
-        laws, within, inside, of, cpu = np.array(rows, dtype=float).T
-        print(
-            f"{name:9} {course:7} {hold:3} {laws.sum():.0f}/{n} {within.sum():.0f}/{n} "
-            f"{inside.sum():.0f}/{of.sum():.0f} {np.median(cpu):.2f} {chosen}",
-            flush=True,
-        )
-
-
-WHAT = [
-    "counts",
-    "lack_of_fit",
-    "short",
-    "degrees",
-    "samples",
-    "thruster",
-    "collection",
-    "penalties",
-    "waves",
-    "chain",
-    "courses",
-]
+        counts = np.zeros(4, dtype=int)
+        for name, number in product(collected_names(), range(n)):
+            system, runs = collected_draw(name, noise, number)
+            found = ep.estimate(runs, system.model.library)
+            true, used = system.model.coef != 0.0, found.model.coef != 0.0
+            missed, false = (true & ~used).sum(), (used & ~true).sum()
+            counts += missed + false == 0, 1, missed, false
+        right, of, missed, false = counts.tolist()
+        print(f"{weight:6g}  {noise:5g}  {right}/{of}  {missed:12d}  {false:11d}", flush=True)
 
 
 def main() -> None:
     every = [*DRAWS, *OTHERS]
+    what: dict[str, Callable[[argparse.Namespace], None]] = {
+        "counts": lambda asked: counts(asked.systems, asked.noises, asked.kind, asked.n),
+        "lack_of_fit": lambda asked: lacks_of_fit(asked.systems, asked.n),
+        "short": lambda asked: short(asked.n),
+        "degrees": lambda asked: degrees(asked.n),
+        "samples": lambda _: samples(),
+        "waves": lambda asked: waves(asked.sizes or [5, 8, 12, 20], asked.n),
+        "chain": lambda asked: chain(asked.sizes or [20], asked.n),
+        "thruster": lambda _: thruster(),
+        "penalties": lambda asked: penalties(asked.noises, asked.n),
+    }
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
-    parser.add_argument("what", choices=WHAT)
+    parser.add_argument("what", choices=what)
     parser.add_argument("--n", type=int, default=100)
     parser.add_argument("--systems", nargs="+", default=every, choices=every)
     parser.add_argument("--noises", nargs="+", type=float, default=[0.0, 0.05, 0.2, 0.4])
     parser.add_argument("--sizes", nargs="+", type=int)
     parser.add_argument("--kind", default="white", choices=KINDS)
     asked = parser.parse_args()
-    if asked.what == "counts":
-        counts(asked.systems, asked.noises, asked.kind, asked.n)
-    elif asked.what == "lack_of_fit":
-        lacks_of_fit(asked.systems, asked.n)
-    elif asked.what == "degrees":
-        degrees(asked.n)
-    elif asked.what == "collection":
-        collection(asked.noises, asked.n)
-    elif asked.what == "waves":
-        waves(asked.sizes or [5, 8, 12, 20], asked.n)
-    elif asked.what == "chain":
-        chain(asked.sizes or [20], asked.n)
-    elif asked.what == "penalties":
-        penalties(asked.noises, asked.n)
-    elif asked.what == "short":
-        short(asked.n)
-    elif asked.what == "courses":
-        courses(asked.noises[0] or 0.05, asked.n)
-    elif asked.what == "samples":
-        samples()
-    else:
-        thruster()
+    what[asked.what](asked)
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
 """Agreement with stored runs of HallThruster.jl v0.22: `python -m benchmarks.hallthruster`.
 
-Its spt100 tutorial and its two calibrated SPT-100, read from inputs as theirs, and LANDMARK's fluid
-cases at N = 200 with its inner radius (these need EP2SINDY_DATA=folder with the benchmark's own
-landmark_rates.csv). Means over 1.5 to 2 ms; what is theirs lies in tests/data, with its source.
-Prints the table of docs/thruster.md; tests/test_hallthruster_agreement.py holds it.
+Its spt100 tutorial and its two calibrated SPT-100, and LANDMARK's fluid cases at N = 200 with its
+inner radius (these need EP2SINDY_DATA=folder with the benchmark's own landmark_rates.csv). Means
+over 1.5 to 2 ms; what is theirs lies in tests/data, with its source. Prints the table of
+docs/thruster.md; tests/test_hallthruster_agreement.py holds it.
 """
 
 from __future__ import annotations
@@ -11,10 +11,9 @@ from __future__ import annotations
 import json
 import math
 import os
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 from unittest.mock import patch
 
@@ -23,14 +22,28 @@ import xarray as xr
 import yaml
 
 import ep2sindy as ep
-from benchmarks.hallthruster_input import simulate_hallthruster_input
 from benchmarks.landmark import LANDMARK_POINT, landmark_thruster, read_landmark_rates
 from ep2sindy.signals.spectrum import dominant_frequency
+from ep2sindy.thruster import (
+    AnodeSheath,
+    AnomalousTransport,
+    Background,
+    GaussianTransport,
+    MagneticFieldTable,
+    OperatingPoint,
+    PressureShift,
+    ThermalPlume,
+    Thruster,
+    propellant,
+    wall_material,
+)
 from ep2sindy.thruster.axial import simulate as axial
 from ep2sindy.thruster.axial.model import build_model as axial_model
 from ep2sindy.thruster.axial.state_kernels import AxialModel
 from ep2sindy.thruster.constants import K_BOLTZMANN, M_XENON
+from ep2sindy.thruster.transport import Transport
 
+TORR = 101325.0 / 760.0  # Pa
 ROOT = Path(__file__).parents[1]
 DATA = ROOT / "tests" / "data"
 SPT100 = ROOT / "conf" / "thruster" / "spt100.yaml"
@@ -46,46 +59,8 @@ STORED = {
 STORED_N_I = {5.07: 1.9499, 10.4: 4.3175, 15.73: 7.1716, 18.93: 6.9584, 20.53: 6.7747,
               22.13: 24.785, 24.27: 28.001, 26.93: 16.227, 29.6: 2.6895, 30.67: 2.1607,
               31.73: 2.0106, 37.07: 1.7629, 42.4: 1.6212, 53.07: 1.4087}  # fmt: skip
-COMMON = {
-    "transition_length": 4.174e-3, "cathode_Tev": 3.26173, "anode_Tev": 3.26173,
-    "ion_wall_losses": True, "electron_ion_collisions": True, "solve_plume": True,
-    "background_pressure_Torr": 1e-5, "background_temperature_K": 300.0,
-}  # fmt: skip
-
-
-def _gaussian(hall_min: float, hall_max: float, center: float, width: float) -> dict[str, Any]:
-    """Their transport, shifted by the background's pressure."""
-    names = {"hall_min": hall_min, "hall_max": hall_max, "center": center, "width": width}
-    return {
-        "type": "LogisticPressureShift", "model": {"type": "GaussianBohm", **names},
-        "z0": -0.17682, "dz": 0.3594, "pstar": 4.735361e-05, "alpha": 15.0,
-    }  # fmt: skip
-
-
-CALIBRATED: dict[str, dict[str, Any]] = {
-    "baseline": {
-        **COMMON, "discharge_voltage": 300, "cathode_coupling_voltage": 30,
-        "anom_model": _gaussian(0.007015845, 0.0702476, 0.02506, 0.0065),
-        "wall_loss_model": {"type": "WallSheath", "material": "BNSiO2", "loss_scale": 0.86904},
-        "neutral_ingestion_multiplier": 6.23341, "apply_thrust_divergence_correction": False,
-    },
-    "withplume": {
-        **COMMON, "discharge_voltage": 400, "cathode_coupling_voltage": 35,
-        "anom_model": _gaussian(0.00625, 0.0625, 0.026, 0.005),
-        "wall_loss_model": {"type": "WallSheath", "material": "BNSiO2", "loss_scale": 0.5},
-        "neutral_ingestion_multiplier": 6.0, "apply_thrust_divergence_correction": True,
-    },
-}  # fmt: skip
-INGESTED_MG_S = {"baseline": 0.096, "withplume": 0.093}  # their multiplier on a pressure in Pa
 NEUTRAL_SOUND = math.sqrt(5.0 / 3.0 * K_BOLTZMANN * 500.0 / M_XENON)  # 230 m/s
-LANDMARK_RUNS = (  # case, cells, wave speed of the neutrals
-    (1, 100, 0.0),
-    (1, 200, 0.0),
-    (1, 400, 0.0),
-    (1, 200, NEUTRAL_SOUND),
-    (2, 200, 0.0),
-    (3, 200, 0.0),
-)
+LANDMARK_RUNS = ((1, NEUTRAL_SOUND), (2, 0.0), (3, 0.0))  # case, wave speed of the neutrals
 CASE_1_HZ = 10.4e3  # of the residual oscillation of LANDMARK case 1
 LANDMARK = {1: (8.19, 0.16), 2: (8.09, 0.09), 3: (7.88, 3.34)}  # I_d: mean, deviation (A)
 DECAY = -1.8e3  # 1/s, of the oscillation of LANDMARK case 2
@@ -113,10 +88,85 @@ def deviations(mean: xr.Dataset, reference: dict[str, np.ndarray]) -> dict[str, 
     return found
 
 
-def tutorial_run() -> xr.Dataset:
-    """Their tutorial from an input file as theirs."""
-    xenon = {"gas": "Xenon", "max_charge": 1, "flow_rate_kg_s": 5e-6}
-    return spt100_run({"propellants": [xenon], "discharge_voltage": 300}, n_cells=100)
+def spt100(
+    transport: Transport, walls: tuple[float, float], transition: float, T_e_eV: float, **more: Any
+) -> Thruster:
+    """Their SPT-100, its magnetic field that of thruster=spt100.
+
+    walls: factors on the losses of electrons and ions. T_e_eV: at both ends. The conductivity is
+    Mitchner & Kruger's (Partially Ionized Gases, 1973, p. 94): 2.4/(1 + nu_ei/(sqrt(2) nu)), and
+    multiplies the gradient of 1.5 T_e there.
+    """
+    field = yaml.safe_load(SPT100.read_text())["magnetic_field"]
+    return Thruster(
+        domain_length=0.08,
+        magnetic_field=MagneticFieldTable(field["distance"], field["B"]),
+        transport=transport,
+        propellant=propellant("xenon_5eV"),
+        wall=wall_material(
+            "BN-SiO2", electron_scale=walls[0], ion_scale=walls[1], plume_collisions=0.0,
+            transition=transition,
+        ),
+        anode=AnodeSheath(T_e_eV, potential_weight=2.0),
+        cathode_T_e_eV=T_e_eV,
+        series_resistance=0.0,
+        conduction_factor=1.5 * 2.4,
+        conduction_coulomb=2.0**-0.5,
+        **more,
+    )  # fmt: skip
+
+
+def tutorial() -> tuple[Thruster, OperatingPoint]:
+    """Their tutorial, with their defaults."""
+    transport = AnomalousTransport(1 / 160, 1 / 16, 2.5e-3)
+    thruster = spt100(transport, (1.0, 0.0), 2.5e-3, 2.0, charge_states=1, cathode_potential=0.0)
+    return thruster, OperatingPoint(300.0, 5.0, 150.0)
+
+
+@dataclass(frozen=True)
+class Calibrated:
+    """One of their calibrated SPT-100, in their numbers: c far away and in its trough, m, V."""
+
+    voltage: float
+    coupling: float
+    c: tuple[float, float]
+    center: float
+    width: float
+    loss_scale: float
+    ingestion: float
+    axial_thrust: bool
+
+    @property
+    def parts(self) -> tuple[Thruster, OperatingPoint]:
+        """With three charges and background gas, whose Torr are taken for Pa as it is ingested."""
+        transport = PressureShift(
+            GaussianTransport(*self.c, center=self.center - 0.025, width=self.width),
+            z0=-0.17682, dz=0.3594, pressure_Pa=TORR * 4.735361e-05, alpha=15.0,
+        )  # fmt: skip
+        thruster = spt100(
+            transport, (self.loss_scale, self.loss_scale), 4.174e-3, 3.26173, charge_states=3,
+            cathode_potential=self.coupling, plume=ThermalPlume(axial_thrust=self.axial_thrust),
+        )  # fmt: skip
+        background = Background(1e-5 * TORR, ingestion=self.ingestion / TORR)
+        return thruster, OperatingPoint(self.voltage, 5.0, 150.0, background=background)
+
+
+CALIBRATED = {
+    "baseline": Calibrated(
+        300.0, 30.0, (0.0702476, 0.007015845), 0.02506, 0.0065, 0.86904, 6.23341, False
+    ),
+    "withplume": Calibrated(400.0, 35.0, (0.0625, 0.00625), 0.026, 0.005, 0.5, 6.0, True),
+}
+
+
+def spt100_run(
+    parts: tuple[Thruster, OperatingPoint], n_cells: int, duration_s: float = 2e-3
+) -> xr.Dataset:
+    """A thruster at its point, on their grid and from their start."""
+    return ep.thruster.simulate(
+        *parts, duration_s=duration_s, warm_up_s=0.0, n_cells=n_cells, stretch=1.0,
+        coldest_T_e_eV=1.5, progress=False,
+    )  # fmt: skip
 
 
 def calibrated_run(
@@ -128,49 +178,14 @@ def calibrated_run(
     alone. Neutrals then stay dense where ions spread, and ions are born of them over the plume's
     whole area, some 6 % more than neutrals are consumed.
     """
-    xenon = {"gas": "Xenon", "max_charge": 3, "flow_rate_kg_s": 5e-6}
-    config = {**CALIBRATED[name], "propellants": [xenon]}
 
     def build_model(*given: Any, **settings: Any) -> AxialModel:
         model = axial_model(*given, **settings)
         before, behind = model.inverse_dz.copy(), model.inverse_dz.copy()
         return model._replace(neutral_before=before, neutral_behind=behind)
 
-    if not neutrals_stay:
-        return spt100_run(config, n_cells, duration_s)
-    with patch.object(axial, "build_model", build_model):
-        return spt100_run(config, n_cells, duration_s)
-
-
-def reduced_run(name: str, *, duration_s: float = 2e-3, n_cells: int = 150) -> xr.Dataset:
-    """The same with two charges and without the plume's area, and with the flow that is ingested.
-
-    Neutrals have the default speed: a speed next to `propellants`, as in these files, is read by
-    neither code. The ingested flow is taken at a pressure in Pa (HallThruster.jl takes Torr).
-    """
-    flow = (5.0 + INGESTED_MG_S[name]) * 1e-6
-    xenon = {"gas": "Xenon", "max_charge": 2, "flow_rate_kg_s": flow}
-    left_out = {"solve_plume": False, "neutral_ingestion_multiplier": 0.0}
-    config = {**CALIBRATED[name], **left_out, "propellants": [xenon]}
-    return spt100_run(config, n_cells, duration_s)
-
-
-def spt100_run(config: dict[str, Any], n_cells: int, duration_s: float = 2e-3) -> xr.Dataset:
-    """An SPT-100 from an input file as theirs, its magnetic field that of thruster=spt100."""
-    field = yaml.safe_load(SPT100.read_text())["magnetic_field"]
-    rows = [f"{0.025 + z},{B}" for z, B in zip(field["distance"], field["B"], strict=True)]
-    geometry = {"inner_radius": 0.035, "outer_radius": 0.05, "channel_length": 0.025}
-    thruster = {"geometry": geometry, "magnetic_field": {"file": "bfield.csv"}}
-    grid = {"type": "EvenGrid", "num_cells": n_cells}
-    given = {
-        "config": {"thruster": thruster, "domain": [0.0, 0.08], **config},
-        "simulation": {"duration": duration_s, "grid": grid},
-    }
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / "spt100.json"
-        path.with_name("bfield.csv").write_text("\n".join(rows) + "\n")
-        path.write_text(json.dumps(given))
-        return simulate_hallthruster_input(path, cache=folder, sample_s=1.5e-6, progress=False)
+    with patch.object(axial, "build_model", build_model if neutrals_stay else axial_model):
+        return spt100_run(CALIBRATED[name].parts, n_cells, duration_s)
 
 
 def figures(run: xr.Dataset) -> dict[str, float]:
@@ -200,7 +215,7 @@ def net_thrust(run: xr.Dataset) -> float:
     return float(mean["thrust"]) - backwards
 
 
-def landmark_run(case: int, *, neutral_wave: float = 0.0, n_cells: int = 200) -> xr.Dataset:
+def landmark_run(case: int, *, neutral_wave: float = 0.0) -> xr.Dataset:
     """LANDMARK's case as theirs: N = 200, inner radius 34.5 mm, first order in case 1.
 
     neutral_wave: speed of sound of the neutrals in m/s that enters their flux. HallThruster.jl
@@ -214,7 +229,7 @@ def landmark_run(case: int, *, neutral_wave: float = 0.0, n_cells: int = 200) ->
 
     with patch.object(axial, "build_model", build_model):
         return ep.thruster.simulate(
-            thruster, LANDMARK_POINT, duration_s=2e-3, warm_up_s=0.0, n_cells=n_cells, stretch=1.0,
+            thruster, LANDMARK_POINT, duration_s=2e-3, warm_up_s=0.0, n_cells=200, stretch=1.0,
             reconstruct=case > 1, progress=False,
         )  # fmt: skip
 
@@ -237,7 +252,7 @@ def percent(off: dict[str, float]) -> str:
 
 
 def main() -> None:
-    run = tutorial_run()
+    run = spt100_run(tutorial(), 100)
     current = late(run)["I_d"]
     print(
         f"spt100 tutorial: I_d {float(current.mean()):.3f} A, std {float(current.std()):.2f} "
@@ -249,7 +264,6 @@ def main() -> None:
         for kind, run in (
             ("as it is", calibrated_run(name)),
             ("as it is, neutrals stay", calibrated_run(name, neutrals_stay=True)),
-            ("reduced", reduced_run(name)),
         ):
             ours = figures(run)
             line = ", ".join(f"{k} {ours[k]:.2f} ({v})" for k, v in theirs.items())
@@ -263,12 +277,12 @@ def main() -> None:
     if not RATE_TABLE.exists():
         print("LANDMARK: name the folder of landmark_rates.csv with EP2SINDY_DATA")
         return
-    for case, n, wave in LANDMARK_RUNS:
-        run, theirs = landmark_run(case, neutral_wave=wave, n_cells=n), LANDMARK[case]
+    for case, wave in LANDMARK_RUNS:
+        run, (mean, std) = landmark_run(case, neutral_wave=wave), LANDMARK[case]
         part = late(run)["I_d"]
-        line = f"LANDMARK case {case}, N = {n}{', their wave speed' if wave else ''}: "
+        line = f"LANDMARK case {case}, N = 200{', their wave speed' if wave else ''}: "
         line += f"I_d {float(part.mean()):.2f} / {float(part.std()):.2f} A"
-        line += f" ({theirs[0]} / {theirs[1]}), {1e-3 * line_Hz(run):.1f} kHz"
+        line += f" ({mean} / {std}), {1e-3 * line_Hz(run):.1f} kHz"
         if case < 3:
             off = deviations(late(run).mean("time"), stored(f"hallthruster_landmark_{case}.csv"))
             line += f"; {percent(off)}"

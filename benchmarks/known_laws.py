@@ -4,7 +4,7 @@
     python -m benchmarks.known_laws 5      # seeds per noise level
 
 A Brusselator over one parameter, and a breathing discharge in SI units over voltage and mass flow.
-Their coefficients are linear, quadratic and reciprocal in these, and `ep.discover` is stated
+Their coefficients are linear, quadratic and reciprocal in these, and `ep.discover` is told
 neither terms nor functions. Per system and noise: the seeds whose terms are all right; the root
 mean square error of all coefficients at all points, each point alone and by the law; the errors of
 rates at points left out, as the law says them; CPU time; the functions of the law.
@@ -67,10 +67,11 @@ def cycles(system: str) -> list[ep.Trajectory]:
     law, (start, period_s), found = truth(system), STARTS[system], []
     for point in POINTS[system]:
         model, t = law.at(extrapolate=True, **point), np.arange(4000) * period_s / PER_PERIOD
-        precompile = model.simulate(t, start).states[2000:]
-        cycle = find_cycle(t[:2000], precompile)
+        settled = model.simulate(t, start).states[2000:]
+        cycle = find_cycle(t[:2000], settled)
+        assert cycle is not None
         t = np.arange(N_PERIODS * PER_PERIOD) / (PER_PERIOD * cycle.frequency_Hz)
-        found.append(ep.Trajectory(t, model.simulate(t, precompile[0]).states, law.states))
+        found.append(ep.Trajectory(t, model.simulate(t, settled[0]).states, law.states))
     return found
 
 
@@ -92,6 +93,8 @@ def outcome(system: str, noise: float, seed: int) -> tuple[list[float], str]:
     if any(set(found.model.terms(s)) != set(LAWS[system][s]) for s in law.states):
         return [], ""
     at, own = POINTS[system], found.law
+    assert own is not None
+    assert own.left_out is not None
     models = [
         [point.model for point in found.points.values()],
         [own.at(extrapolate=True, **point) for point in at],
@@ -100,9 +103,8 @@ def outcome(system: str, noise: float, seed: int) -> tuple[list[float], str]:
     off = np.array([[m.coef for m in each] for each in models])[:, true != 0.0] / true[true != 0.0]
     errors = 100.0 * np.sqrt(np.square(off - 1.0).mean(axis=1))
     left_out = 100.0 * own.left_out
-    return [*errors.tolist(), float(np.median(left_out)), left_out.max(), spent_s], ", ".join(
-        own.functions.names
-    )
+    figures = [*errors.tolist(), float(np.median(left_out)), float(left_out.max()), spent_s]
+    return figures, ", ".join(own.functions.names)
 
 
 def main() -> None:

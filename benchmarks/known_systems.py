@@ -43,7 +43,7 @@ class Known:
         return System(name, model, np.array(self.initial), self.duration_s, self.rate_Hz)
 
 
-def _lorenz96(n: int, forcing: float) -> dict[str, dict[str, float]]:
+def lorenz_96(n: int, forcing: float = 8.0) -> dict[str, dict[str, float]]:
     """x_i' = (x_{i+1} - x_{i-2}) x_{i-1} - x_i + F, on a ring."""
 
     def product(i: int, j: int) -> str:
@@ -111,7 +111,7 @@ OTHERS: Mapping[str, Known] = {
         },
         3, (0.1, 0.1, 0.1), 30.0, 60.0,
     ),
-    "lorenz96": Known(_lorenz96(5, 8.0), 2, (8.0, 8.0, 8.01, 8.0, 8.0), 15.0, 100.0),
+    "lorenz96": Known(lorenz_96(5), 2, (8.0, 8.0, 8.01, 8.0, 8.0), 15.0, 100.0),
     "hyperrossler": Known(
         {
             "x": {"y": -1.0, "z": -1.0},

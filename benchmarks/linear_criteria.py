@@ -14,7 +14,6 @@ in zero dimensions say of the averages of the same record: the table of docs/the
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -27,18 +26,17 @@ from ep2sindy.studies.processes import fitted_rate, recorded_rates
 IONS, NEUTRALS = sustained.STATES
 LIBRARY = ep.polynomial(sustained.STATES, degree=3)
 STEP = 1e-5  # of a logarithm, for the orders
-# Structures of conf/exp/theories.yaml: terms of ionization, net of what comes back, and of the ions
-# that leave. Predator and prey have neutrals that grow by themselves, as fast as they cross.
+# Terms of ionization, net of what comes back, and of the ions that leave: of the law, of the law of
+# `thruster=lif`, and of structures of conf/exp/theories.yaml. Predator and prey have neutrals that
+# grow by themselves, as fast as they cross.
+LAW = (["n_i^2*n_n", "n_i*n_n^2"], ["n_i", "n_i^2"])
 STRUCTURES = {
-    "supply": (["n_i*n_n"], ["n_i"]),
-    "back_flow": (["n_i*n_n", "n_i"], ["n_i"]),
-    "field": (["n_i*n_n", "n_i*n_n^2", "n_i"], ["n_i", "n_i*n_n"]),
-    "heating": (["n_i*n_n", "n_i^2*n_n"], ["n_i"]),
-    "terms of the law": (["n_i^2*n_n", "n_i*n_n^2"], ["n_i", "n_i^2"]),
-    "law_back": (
-        ["n_i*n_n", "n_i^2*n_n", "n_i*n_n^2", "n_i"],  # of benchmarks.sustained
+    "terms of lif": (
+        ["n_i*n_n", "n_i^2*n_n", "n_i*n_n^2", "n_i"],
         ["n_i", "n_i^2", "n_i*n_n^2"],
     ),
+    "supply": (["n_i*n_n"], ["n_i"]),
+    "back_flow": (["n_i*n_n", "n_i"], ["n_i"]),
 }
 
 
@@ -88,7 +86,7 @@ def law_at_rest(whole: sustained.Record) -> tuple[complex, Balance]:
     assert rest is not None
     moved, leave = [
         {term: sign * model.terms(IONS)[term] for term in terms}
-        for sign, terms in zip((1.0, -1.0), STRUCTURES["terms of the law"], strict=True)
+        for sign, terms in zip((1.0, -1.0), LAW, strict=True)
     ]
     columns = [LIBRARY.index(term) for term in moved]
     ionized = float(LIBRARY.evaluate(rest.state[None])[0, columns] @ list(moved.values()))
@@ -130,36 +128,23 @@ def theories(whole: sustained.Record, crossing: float) -> dict[str, Balance]:
     return found
 
 
-def given_back(whole: sustained.Record) -> str:
-    """What walls and anode give back, in fractions of ionization."""
-    means = {name: float(rate.mean()) for name, rate in whole.balances[""].items()}
-    walls, both = means["wall_loss"], means["returned"]
-    fractions = [100.0 * rate / means["ionization"] for rate in (walls, both - walls)]
-    return "given back: by the walls {:.0f} %, by the anode {:.0f} % of ionization".format(
-        *fractions
-    )
-
-
 def row(name: str, found: complex, balance: Balance) -> str:
     growth, frequency = found.real, abs(found.imag) / (2e3 * np.pi)
     return f"    {name:18s} growth {growth:7.0f} 1/s, {frequency:5.1f} kHz   {balance}"
 
 
 def main() -> None:
-    """Print the points of the default source, or those of the sets that are named."""
-    for name in sys.argv[1:] or ["default"]:
-        for label in sustained.oscillating(name):
-            whole = sustained.record(label, sustained.CHANNEL, name)
-            print(f"\n{name}, {label}: cycle {sustained.field(label, name).attrs['f_kHz']:.1f} kHz")
-            print(f"    {given_back(whole)}")
-            if name == "default":
-                turning, balance = law_at_rest(whole)
-                print(row("law, Jacobian", turning, balance))
-                print(row("law, closed form", balance.eigenvalue, balance))
-            speed = sustained.LIF_SPEED if name == "lif" else sustained.POINTS[label].neutral_speed
-            crossing = float(speed) / ep.thruster.Thruster().channel_length
-            for theory, balance in theories(whole, crossing).items():
-                print(row(theory, balance.eigenvalue, balance), flush=True)
+    """Print all points of the default source."""
+    for label in sustained.POINTS:
+        whole = sustained.record(label)
+        print(f"\n{label}: cycle {sustained.field(label).attrs['f_kHz']:.1f} kHz")
+        turning, balance = law_at_rest(whole)
+        print(row("law, Jacobian", turning, balance))
+        print(row("law, closed form", balance.eigenvalue, balance))
+        speed = float(sustained.POINTS[label].neutral_speed_at(np.zeros(1))[0])
+        crossing = speed / ep.thruster.Thruster().channel_length
+        for theory, balance in theories(whole, crossing).items():
+            print(row(theory, balance.eigenvalue, balance), flush=True)
 
 
 if __name__ == "__main__":

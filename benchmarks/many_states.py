@@ -19,6 +19,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
 
+from benchmarks import known_systems
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import polynomial
 from ep2sindy.model.model import SparseModel
@@ -63,16 +64,7 @@ def predators(n: int) -> SparseModel:
 
 
 def lorenz_96(n: int) -> SparseModel:
-    def product(i: int, j: int) -> str:
-        return "*".join(f"x{k}" for k in sorted((i % n, j % n)))
-
-    return model_of(
-        {
-            f"x{k}": {product(k + 1, k - 1): 1.0, product(k - 2, k - 1): -1.0, f"x{k}": -1.0}
-            | {"1": 8.0}
-            for k in range(n)
-        }
-    )
+    return model_of(known_systems.lorenz_96(n))
 
 
 def cases() -> list[Case]:

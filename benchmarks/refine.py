@@ -4,8 +4,8 @@ Synthetic breathing data, 12001 samples every 1.5 us, 2 % noise and 3 % lines at
 a model driven by two inputs. 30 windows of 100 samples that start at the data, one thread: the
 CPU time until the loss is within 1e-4 of its optimum; ours is that of a whole call, from windows
 to covariance, with a tolerance just enough for that. The simplex is the thesis's, with scipy's
-odeint window by window: on the model's own right-hand side, which serves any library; on the
-leanest one that still does; and on one written by hand for this model.
+odeint window by window, on a right-hand side written by hand for this model. Prints the table of
+docs/refinement.md.
 
     python -m benchmarks.refine
 """
@@ -21,14 +21,13 @@ from scipy.integrate import odeint, solve_ivp
 from scipy.optimize import minimize
 from threadpoolctl import threadpool_limits
 
-from benchmarks.nelder_mead import window_paths
 from benchmarks.timing import cpu_s
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import named_terms
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.refinement.methods.gradient_descent import GradientDescent
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
-from ep2sindy.refinement.problem import Iteration, RefinementProblem, RefinementSettings
+from ep2sindy.refinement.problem import Iteration, RefinementProblem
 from ep2sindy.refinement.refine import refine
 from ep2sindy.refinement.windows import WindowBatch, cut_windows
 from tests.single_shooting import SingleShooting
@@ -156,30 +155,12 @@ def forced_by_hand(batch: WindowBatch, coef: np.ndarray, scaling: np.ndarray) ->
     return np.stack([odeint(rhs, data[0], t, args=(cubics,)) for data, cubics in paths])
 
 
-def by_model(work: RefinementProblem, model: SparseModel, scaling: np.ndarray) -> np.ndarray:
-    """Trajectories by scipy's odeint on the model's own right-hand side."""
-    batch = work.batches[0]
-    coef = np.zeros_like(model.coef.T)
-    coef[model.coef.T != 0.0] = model.coef.T[model.coef.T != 0.0] * scaling
-    scaled = replace(model, coef=coef.T)
-    scale, of_inputs = np.split(batch.scale, [len(model.states)])
-
-    def rhs(x: np.ndarray, t: float, cubics: np.ndarray) -> np.ndarray:
-        k = min(max(int(t), 0), len(cubics) - 1)
-        inputs = of_inputs * ((t - k) ** np.arange(3, -1, -1) @ cubics[k])
-        return batch.step_s * scaled.derivative(x * scale, inputs) / scale
-
-    t = np.arange(batch.data.shape[1], dtype=np.float64)
-    paths = zip(batch.data, batch.inputs, strict=True)
-    return np.stack([odeint(rhs, data[0], t, args=(cubics,)) for data, cubics in paths])
-
-
 def simplex_s(
     paths: Callable[[np.ndarray], np.ndarray], data: np.ndarray, *, n_free: int, goal: float
 ) -> float:
     """CPU time until Nelder-Mead first meets the goal."""
     begin = time.process_time()
-    reached = []
+    reached: list[float] = []
 
     def loss(scaling: np.ndarray) -> float:
         value = float(np.square(paths(scaling) - data).mean())
@@ -209,7 +190,7 @@ def descent_s(work: RefinementProblem, method: GradientDescent, *, goal: float) 
     return times[below[0] - 1] - times[0] if below else float("nan")
 
 
-def ours(case: Case, method: MultipleShooting | SingleShooting, *, free_start: bool) -> float:
+def ours(case: Case, method: MultipleShooting | SingleShooting) -> float:
     """Loss of the whole call."""
     found = refine(
         case.start,
@@ -217,7 +198,7 @@ def ours(case: Case, method: MultipleShooting | SingleShooting, *, free_start: b
         n_windows=N_WINDOWS,
         window=WINDOW,
         method=method,
-        free_start=free_start,
+        free_start=False,
         n_reweights=0,
         seed=np.random.default_rng(0),
     )
@@ -225,59 +206,30 @@ def ours(case: Case, method: MultipleShooting | SingleShooting, *, free_start: b
 
 
 def compare(case: Case) -> None:
-    shooting, brief = MultipleShooting(), MultipleShooting(tolerance=1e-2)
-    work = problem(case)
-    goal = (1.0 + CLOSE) * ours(case, MultipleShooting(tolerance=1e-10), free_start=False)
-    assert ours(case, brief, free_start=False) <= goal
-    base = cpu_s(partial(ours, case, brief, free_start=False), n_runs=9)
+    brief, work = MultipleShooting(tolerance=1e-2), problem(case)
+    goal = (1.0 + CLOSE) * ours(case, MultipleShooting(tolerance=1e-10))
+    assert ours(case, brief) <= goal
+    base = cpu_s(partial(ours, case, brief), n_runs=9)
     print(f"{case.name}: {N_WINDOWS} windows x {WINDOW} samples, to {CLOSE:g} of the optimum")
     print(f"  multiple shooting                      {base:9.4f} s")
-    whole = cpu_s(partial(ours, case, shooting, free_start=False), n_runs=9)
-    print(f"  the same, to its usual tolerance       {whole:9.4f} s")
-    free = cpu_s(partial(ours, case, shooting, free_start=True), n_runs=9)
-    print(f"  the same, starts fitted too            {free:9.4f} s")
-    others: dict[str, float] = {
-        "forward sensitivities, least_squares": cpu_s(
-            partial(ours, case, SingleShooting(), free_start=False), n_runs=3
-        ),
-        "torchdiffeq, L-BFGS": descent_s(work, GradientDescent(), goal=goal),
-    }
-    data, n_free = work.data[0], work.n_free
     unit = work.equations[0].by_scaling.sum(axis=(0, 1))
     hand = by_hand if case.name == "predator-prey" else forced_by_hand
-    for name, paths in {
-        "by hand": partial(hand, work.batches[0], unit),
-        "lean library": partial(window_paths, work),
-        "model.derivative": partial(by_model, work, case.start),
-    }.items():
-        others[f"simplex, odeint, {name}"] = simplex_s(paths, data, n_free=n_free, goal=goal)
+    paths = partial(hand, work.batches[0], unit)
+    others = {
+        "simplex, odeint, by hand": simplex_s(paths, work.data[0], n_free=work.n_free, goal=goal),
+        "gradient descent (L-BFGS)": descent_s(work, GradientDescent(), goal=goal),
+        "forward sensitivities, least_squares": cpu_s(
+            partial(ours, case, SingleShooting()), n_runs=3
+        ),
+    }
     for name, value in others.items():
         print(f"  {name:<38} {value:9.4f} s, {value / base:.0f} times")
-
-
-def many(n_points: int, rng: np.random.Generator, *, points_per_batch: int) -> None:
-    """A grid of points with 10 windows each, all from the same start."""
-    t, states = breathing_states(1500)
-    data = [[Trajectory(t, contaminated(states, t, rng), STATES)] for _ in range(n_points)]
-    begin = time.process_time()
-    found = refine(
-        [START] * n_points, data, RefinementSettings(n_windows=10, window=WINDOW),
-        points_per_batch=points_per_batch, seed=rng,
-    )  # fmt: skip
-    each_ms = 1e3 * (time.process_time() - begin) / n_points
-    n_converged = sum(each.status == "converged" for each in found)
-    print(
-        f"{n_points} points x 10 windows, {points_per_batch} in a batch: {each_ms:.2f} ms each, "
-        f"{n_converged} converged"
-    )
 
 
 def main() -> None:
     torch.set_num_threads(1)
     with threadpool_limits(limits=1):
         compare(breathing(np.random.default_rng(0)))
-        for points_per_batch in (8, 2009):
-            many(2009, np.random.default_rng(1), points_per_batch=points_per_batch)
         compare(forced(np.random.default_rng(2)))
 
 

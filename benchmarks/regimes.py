@@ -3,7 +3,7 @@
     python -m benchmarks.regimes [--seeds 3]
 
 20 x 15 points of 1500 samples, best subsets of five terms, 32 bootstraps in blocks of a period; the
-index counts points away from the transitions. Then a field that one equation governs.
+index counts points away from the transitions.
 """
 
 import argparse
@@ -11,7 +11,7 @@ import argparse
 import numpy as np
 from sklearn.metrics import adjusted_rand_score
 
-from benchmarks.regions import REGIONS, STATES, RegionField, three_regions
+from benchmarks.regions import STATES, RegionField, three_regions
 from ep2sindy.discovery.method import Regression
 from ep2sindy.discovery.pointwise import PointSearch, pointwise
 from ep2sindy.discovery.regimes import Regimes, find_regimes
@@ -22,11 +22,7 @@ from ep2sindy.runtime.parallel import Loky
 from ep2sindy.selection.criteria import EBIC, Knee, Selection
 
 NOISES = (0.0, 0.02, 0.05, 0.1)
-RULES: dict[str, Selection] = {
-    "ebic": EBIC(),
-    "log_knee": Knee(scale="log"),
-    "knee": Knee(),
-}
+RULES: dict[str, Selection] = {"ebic": EBIC(), "knee": Knee()}
 
 
 def found(truth: RegionField, rule: Selection, *, noise: float, seed: int) -> Regimes:
@@ -63,9 +59,6 @@ def main() -> None:
             n_regimes = "/".join(str(run.n_regimes) for run in runs)
             cells.append(f"{noise:.0%}: {min(scores):.2f} to {max(scores):.2f} ({n_regimes})")
         print(f"{name:<10} " + ", ".join(cells), flush=True)
-    one = three_regions(dict.fromkeys(REGIONS, REGIONS["anode"]))
-    counts = [found(one, EBIC(), noise=noise, seed=0).n_regimes for noise in (0.0, 0.05)]
-    print(f"one equation everywhere, ebic: {counts[0]} regime at 0 %, {counts[1]} at 5 %")
 
 
 if __name__ == "__main__":

@@ -1,12 +1,10 @@
-"""What a simulated millisecond costs: `python -m benchmarks.simulator`.
+"""The map of stability of docs/thruster.md: the current's amplitude against plume transport and
+series resistance.
 
-`python -m benchmarks.simulator docs/thruster_stability.png` also draws the stability map of
-docs/thruster.md: the current's amplitude against plume transport and series resistance.
+    python -m benchmarks.simulator docs/thruster_stability.png
 """
 
 import sys
-import time
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,29 +12,7 @@ from matplotlib.figure import Figure
 
 import ep2sindy as ep
 
-TARGETS_CPU_S_PER_MS = {100: 0.15, 200: 0.55}  # on the uniform grid, one core
 POINT = ep.thruster.OperatingPoint(300.0, 5.0)
-
-
-def cost(n_cells: int, *, duration_s: float = 2e-3, n_repeats: int = 3) -> tuple[float, float]:
-    """Least and median CPU seconds of a millisecond, averages recorded, after its warm-up."""
-    settings = {"n_cells": n_cells, "stretch": 1.0, "progress": False}
-    started = ep.thruster.simulate(
-        ep.thruster.Thruster(), POINT, duration_s=3e-4, warm_up_s=1e-3, **settings
-    )
-    spent = []
-    for _ in range(n_repeats):
-        began = time.process_time()
-        ep.thruster.simulate(
-            ep.thruster.Thruster(),
-            POINT,
-            duration_s=duration_s,
-            warm_up_s=0.0,
-            initial=started,
-            **settings,
-        )
-        spent.append((time.process_time() - began) / (1e3 * duration_s))
-    return min(spent), float(np.median(spent))
 
 
 def draw_stability_map(path: Path) -> None:
@@ -45,9 +21,10 @@ def draw_stability_map(path: Path) -> None:
     amplitude = np.full((len(ohms), len(inverse_c2)), np.nan)  # nan where a run diverged
     for i, resistance in enumerate(ohms):
         for j, inverse in enumerate(inverse_c2):
-            thruster = ep.thruster.Thruster()
-            transport = replace(thruster.transport, c_plume=1 / inverse)
-            thruster = replace(thruster, transport=transport, series_resistance=resistance)
+            thruster = ep.thruster.Thruster(
+                transport=ep.thruster.AnomalousTransport(c_plume=1 / inverse),
+                series_resistance=resistance,
+            )
             run = ep.thruster.simulate(
                 thruster, POINT, duration_s=2e-3, warm_up_s=3e-3, progress=False
             )
@@ -68,22 +45,5 @@ def draw_stability_map(path: Path) -> None:
     print(f"drawn: {path}")
 
 
-def main() -> None:
-    """Print the cost on three grids, and of the default run; two grids have a target."""
-    print("cells  CPU-s per ms: least, median")
-    for n_cells in (50, 100, 200):
-        least, median = cost(n_cells)
-        target = TARGETS_CPU_S_PER_MS.get(n_cells)
-        verdict = (
-            "" if target is None else f"  target {target}: {'met' if least <= target else 'missed'}"
-        )
-        print(f"{n_cells:5d}  {least:.3f}, {median:.3f}{verdict}")
-    began = time.process_time()
-    ep.thruster.simulate(ep.thruster.Thruster(), POINT, progress=False)
-    print(f"18 ms and 2 ms of warm-up: {time.process_time() - began:.1f} CPU-s, target 5")
-    if len(sys.argv) > 1:
-        draw_stability_map(Path(sys.argv[1]))
-
-
 if __name__ == "__main__":
-    main()
+    draw_stability_map(Path(sys.argv[1]))

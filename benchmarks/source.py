@@ -11,9 +11,9 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -21,19 +21,10 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
 import ep2sindy as ep
-from ep2sindy.library.library import named_terms
-from ep2sindy.regression.formulations import RandomSplit
-from ep2sindy.regression.front import fit_support
 
 POINTS = {point.label: point for point in ep.thruster.OPERATING_POINTS}
 DOWNSTREAM = (1.5e-2, 2.5e-2)  # m
-EQUATIONS = (
-    ("n_i", ("n_i", "n_i*n_n")),
-    ("n_n", ("1", "n_i", "n_n")),
-    ("n_i", ("n_i*u_iz", "n_i*n_n*R_ion")),
-    ("n_n", ("1", "n_n", "n_i*n_n*R_ion")),
-)
-VARIANTS: dict[str, dict] = {
+VARIANTS: dict[str, dict[str, Any]] = {
     "guessed start, N = 100": {},
     "hard start": {"initial": ep.thruster.ColdStart()},
     "soft start": {"initial": ep.thruster.SoftStart()},
@@ -71,11 +62,11 @@ CHECKED = ("guessed start, N = 100", "hard start", "soft start", "N = 200")
 
 
 @cache
-def full_run(label: str, variant: str, *, warm_up_s: float = 4e-3, duration_s: float = 4e-3):
+def full_run(label: str, variant: str) -> xr.Dataset:
     """One operating point of the default thruster, after its start is forgotten."""
     return ep.thruster.simulate(
-        ep.thruster.Thruster(), POINTS[label], duration_s=duration_s, warm_up_s=warm_up_s,
-        progress=False, **VARIANTS[variant],
+        ep.thruster.Thruster(), POINTS[label], duration_s=4e-3, warm_up_s=4e-3, progress=False,
+        **VARIANTS[variant],
     )  # fmt: skip
 
 
@@ -89,7 +80,7 @@ def measured_sets() -> dict[str, tuple[ep.thruster.Thruster, float]]:
     }
 
 
-def at_point(name: str, voltage: float, flow_mg_s: float, **how: object) -> xr.Dataset:
+def at_point(name: str, voltage: float, flow_mg_s: float, **how: Any) -> xr.Dataset:
     """4 ms of one of the sets, after 4 ms that are not kept."""
     thruster, speed = measured_sets()[name]
     point = ep.thruster.OperatingPoint(voltage, flow_mg_s, neutral_speed=speed)
@@ -108,19 +99,6 @@ def speed_misses_km_s(run: xr.Dataset) -> np.ndarray:
     """How far each speed lies outside of what both pressures have, at the places of `LIF`."""
     speed, (low, high) = mean_speed_km_s(run), np.sort(np.array(list(LIF.values())), axis=1).T
     return np.maximum(np.maximum(low - speed, speed - high), 0.0)
-
-
-def zone_coefficients(run: xr.Dataset) -> np.ndarray:
-    """Least-squares coefficients of the models of `EQUATIONS` on the downstream zone."""
-    form = ep.Differential(split=RandomSplit(test_fraction=0.0))
-    data = ep.zone_average(
-        run, ep.Zone(z=DOWNSTREAM), states=["n_i", "n_n"], inputs=["u_iz", "R_ion"]
-    )
-    names = list(dict.fromkeys(name for _, terms in EQUATIONS for name in terms))
-    library = named_terms(data.names, names)
-    (problem,) = form.assemble([data], library, rng=np.random.default_rng(0))
-    fits = [(fit_support(problem, state, terms).coef_by_term, terms) for state, terms in EQUATIONS]
-    return np.array([coef[name] for coef, terms in fits for name in terms])
 
 
 def alternation_eV(label: str, *, n_steps: int = 4000) -> float:
@@ -154,14 +132,6 @@ def print_cycles() -> None:
     for label in POINTS:
         cells = [row(full_run(label, name)) for name in VARIANTS]
         print(f"{label:10s}" + "".join(f"| {cell:24s}" for cell in cells))
-    print("\nzone coefficients, N = 200 over N = 100: median and largest deviation")
-    for label in POINTS:
-        coarse, fine = (
-            zone_coefficients(full_run(label, name))
-            for name in ("guessed start, N = 100", "N = 200")
-        )
-        off = np.abs(fine / coarse - 1.0)
-        print(f"{label:10s} {np.median(off):.3f}, {off.max():.3f}")
 
 
 def print_balances() -> None:
@@ -205,26 +175,8 @@ def print_measured() -> None:
             )
     print("\nI_d mean / std (A) / frequency (kHz) of the set lif")
     for voltage, flow in (LIF_POINT, (300.0, 4.0), (200.0, 5.0), (400.0, 5.0)):
-        cells = [row(at_point("lif", voltage, flow, **VARIANTS[name])) for name in CHECKED]
-        print(f"{voltage:.0f} V, {flow:g} mg/s" + "".join(f" | {cell}" for cell in cells))
-
-
-def print_walls() -> None:
-    """The cycle of the set lif on three grids, as it is and with larger losses to the wall."""
-    print("\nI_d mean / std (A) / frequency (kHz) of the set lif at 200 V, 5 mg/s, by N")
-    thruster, speed = measured_sets()["lif"]
-    point = ep.thruster.OperatingPoint(200.0, 5.0, neutral_speed=speed)
-    wall = thruster.wall
-    for walls in (wall, replace(wall, electron_scale=0.449, plume_power=0.6)):
-        lossy = replace(thruster, wall=walls)
-        runs = {
-            n: ep.thruster.simulate(
-                lossy, point, duration_s=4e-3, warm_up_s=4e-3, n_cells=n, progress=False
-            )
-            for n in (100, 150, 200)
-        }
-        cells = [f"{n}: {row(run)}" for n, run in runs.items()]
-        print(f"{walls.electron_scale:.3f}, {walls.plume_power:.2f} | " + " | ".join(cells))
+        runs_of_lif = (at_point("lif", voltage, flow, **VARIANTS[name]) for name in CHECKED)
+        print(f"{voltage:.0f} V, {flow:g} mg/s | " + " | ".join(map(row, runs_of_lif)))
 
 
 def print_neighbours() -> None:
@@ -246,45 +198,11 @@ def print_neighbours() -> None:
             print(f"{label:10s} 1/{inverse:<4d} {cells[0]:14s} | {cells[1]}")
 
 
-def print_smoothness() -> None:
-    """How far frequency and deviation scatter about a parabola along the voltage."""
-    print("\n290 to 310 V, 5 mg/s, 6 ms after 4 ms: rms distance from a parabola; multiplicity")
-    volts = np.linspace(290.0, 310.0, 9)
-    for n_cells in (100, 200):
-        runs = [
-            ep.thruster.simulate(
-                ep.thruster.Thruster(), ep.thruster.OperatingPoint(V, 5.0), duration_s=6e-3,
-                warm_up_s=4e-3, n_cells=n_cells, progress=False,
-            )
-            for V in volts
-        ]  # fmt: skip
-        f_kHz = np.array([1e-3 * ep.signals.find_cycle(*current(r)).frequency_Hz for r in runs])
-        std = np.array([r.attrs["I_d_std"] for r in runs])
-        scatter = (100.0 * rms_off_parabola(volts, values) for values in (f_kHz, std))
-        text = ", ".join(
-            f"{name} {v:.3f} %" for name, v in zip(("frequency", "std"), scatter, strict=True)
-        )
-        again = sorted({r.attrs["multiplicity"] for r in runs})
-        print(f"N = {n_cells}: {text}; multiplicity {again}")
-
-
-def current(run: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
-    return run["time"].values, run["I_d"].values[:, None]
-
-
-def rms_off_parabola(x: np.ndarray, values: np.ndarray) -> float:
-    """Relative to the mean."""
-    x = (x - x.mean()) / np.ptp(x)
-    off = values - np.polyval(np.polyfit(x, values, 2), x)
-    return float(np.sqrt(np.mean(off**2)) / values.mean())
-
-
 def main() -> None:
-    """Print every table, or those that are named: cycles, balances, neighbours, smoothness,
-    measured, walls."""
+    """Print every table, or those that are named: cycles, balances, neighbours, measured."""
     parts: dict[str, Callable[[], None]] = {
         "cycles": print_cycles, "balances": print_balances, "neighbours": print_neighbours,
-        "smoothness": print_smoothness, "measured": print_measured, "walls": print_walls,
+        "measured": print_measured,
     }  # fmt: skip
     for name in sys.argv[1:] or parts:
         began = time.process_time()

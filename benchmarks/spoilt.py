@@ -3,7 +3,7 @@
     python -m benchmarks.spoilt [--systems lorenz ...] [--kinds ...] [--n 5] [--noise 0.02]
 
 Per kind and system: right; wrong without a word; wrong with a warning or "ambiguous" alone; right
-and reported as a lack of fit. With `--words`, what was stated of the second, third and fourth.
+and reported as a lack of fit.
 """
 
 from __future__ import annotations
@@ -12,6 +12,8 @@ import argparse
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
 from itertools import product
 
 import numpy as np
@@ -24,109 +26,98 @@ from ep2sindy.systems.draws import DRAWS
 from ep2sindy.systems.systems import System
 
 SYSTEMS = ("lorenz", "van_der_pol", "lotka_volterra", "rossler")
-Spoil = Callable[[System, Trajectory, float, np.random.Generator], np.ndarray]
 
 
-def _white(run: Trajectory, noise: float, rng: np.random.Generator) -> np.ndarray:
-    """Noise of a fraction of every state's RMS."""
-    rms = np.sqrt(np.square(run.states).mean(axis=0))
-    return noise * rms * rng.standard_normal(run.states.shape)
+@dataclass(frozen=True)
+class Draw:
+    """A clean record of a system, and noise of a fraction of every state's RMS."""
+
+    system: System
+    run: Trajectory
+    noise: float
+    rng: np.random.Generator
+
+    def white(self, noise: float) -> np.ndarray:
+        rms = np.sqrt(np.square(self.run.states).mean(axis=0))
+        return noise * rms * self.rng.standard_normal(self.run.states.shape)
+
+    def noisy(self) -> np.ndarray:
+        return self.run.states + self.white(self.noise)
 
 
-def _drift(system: System, run: Trajectory, noise: float, rng: np.random.Generator) -> np.ndarray:
+def _drift(draw: Draw) -> np.ndarray:
     """The first sensor's zero moves by half its signal's spread over the record."""
-    ramp = np.linspace(0.0, 0.5, run.n_samples) * run.states[:, 0].std()
-    states = run.states + _white(run, noise, rng)
-    states[:, 0] += ramp
+    states = draw.noisy()
+    states[:, 0] += np.linspace(0.0, 0.5, len(states)) * draw.run.states[:, 0].std()
     return states
 
 
-def _forced(system: System, run: Trajectory, noise: float, rng: np.random.Generator) -> np.ndarray:
+def _forced(draw: Draw) -> np.ndarray:
     """What nobody recorded moves the first rate up and down by a fifth, some four times in all."""
-    model, none = system.model, np.empty(0)
-    omega = 2.0 * np.pi * 4.37 / run.t[-1]
+    t, start, none = draw.run.t, draw.run.states[0], np.empty(0)
+    omega = 2.0 * np.pi * 4.37 / t[-1]
 
-    def rates(t: float, x: np.ndarray) -> np.ndarray:
-        found = model.derivative(x, none)
-        found[0] *= 1.0 + 0.2 * np.sin(omega * t)
+    def rates(now: float, x: np.ndarray) -> np.ndarray:
+        found = draw.system.model.derivative(x, none)
+        found[0] *= 1.0 + 0.2 * np.sin(omega * now)
         return found
 
-    found = solve_ivp(
-        rates, (run.t[0], run.t[-1]), run.states[0], "DOP853", run.t, rtol=1e-9, atol=1e-9
-    )
-    return found.y.T + _white(run, noise, rng)
+    found = solve_ivp(rates, (t[0], t[-1]), start, "DOP853", t, rtol=1e-9, atol=1e-9)
+    return found.y.T + draw.white(draw.noise)
 
 
-def _late(n: int) -> Spoil:
+def _late(draw: Draw, *, n: int) -> np.ndarray:
     """The last channel comes n samples late."""
-
-    def spoil(system: System, run: Trajectory, noise: float, rng: np.random.Generator):
-        states = run.states + _white(run, noise, rng)
-        states[n:, -1] = states[:-n, -1].copy()
-        return states[n:]
-
-    return spoil
+    states = draw.noisy()
+    states[n:, -1] = states[:-n, -1].copy()
+    return states[n:]
 
 
-def _clipped(fraction: float) -> Spoil:
+def _clipped(draw: Draw, *, fraction: float) -> np.ndarray:
     """The first channel saturates at a fraction of its largest deviation from the middle."""
-
-    def spoil(system: System, run: Trajectory, noise: float, rng: np.random.Generator):
-        states = run.states + _white(run, noise, rng)
-        x = states[:, 0]
-        middle, half = (x.max() + x.min()) / 2.0, fraction * (x.max() - x.min()) / 2.0
-        states[:, 0] = np.clip(x, middle - half, middle + half)
-        return states
-
-    return spoil
+    states = draw.noisy()
+    x = states[:, 0]
+    middle, half = (x.max() + x.min()) / 2.0, fraction * (x.max() - x.min()) / 2.0
+    states[:, 0] = np.clip(x, middle - half, middle + half)
+    return states
 
 
-def _rounded(bits: int) -> Spoil:
+def _rounded(draw: Draw, *, bits: int) -> np.ndarray:
     """Every channel is rounded to so many bits of its range."""
-
-    def spoil(system: System, run: Trajectory, noise: float, rng: np.random.Generator):
-        states = run.states + _white(run, noise, rng)
-        step = np.ptp(states, axis=0) / (2**bits - 1)
-        low = states.min(axis=0)
-        return low + np.round((states - low) / step) * step
-
-    return spoil
+    states = draw.noisy()
+    step, low = np.ptp(states, axis=0) / (2**bits - 1), states.min(axis=0)
+    return low + np.round((states - low) / step) * step
 
 
-def _outliers(system: System, run: Trajectory, noise: float, rng: np.random.Generator):
+def _outliers(draw: Draw) -> np.ndarray:
     """One sample in fifty is off by some RMS."""
-    hit = rng.random(run.states.shape) < 0.02
-    rms = np.sqrt(np.square(run.states).mean(axis=0))
-    return run.states + _white(run, noise, rng) + hit * 2.0 * rms * rng.standard_normal(hit.shape)
+    hit = draw.rng.random(draw.run.states.shape) < 0.02
+    return draw.noisy() + hit * draw.white(2.0)
 
 
-def _multiplied(system: System, run: Trajectory, noise: float, rng: np.random.Generator):
+def _multiplied(draw: Draw) -> np.ndarray:
     """Noise of a fraction of the state itself."""
-    return run.states * (1.0 + 2.0 * noise * rng.standard_normal(run.states.shape))
+    states = draw.run.states
+    return states * (1.0 + 2.0 * draw.noise * draw.rng.standard_normal(states.shape))
 
 
-def _lasting(system: System, run: Trajectory, noise: float, rng: np.random.Generator):
+def _lasting(draw: Draw) -> np.ndarray:
     """AR(1) noise of memory 0.95."""
-    e = _white(run, 1.0, rng)
+    e = draw.white(1.0)
     for k in range(1, len(e)):
         e[k] = 0.95 * e[k - 1] + np.sqrt(1.0 - 0.95**2) * e[k]
-    return run.states + 2.0 * noise * e
+    return draw.run.states + 2.0 * draw.noise * e
 
 
-def _clean(system: System, run: Trajectory, noise: float, rng: np.random.Generator):
-    return run.states + _white(run, noise, rng)
-
-
-KINDS: Mapping[str, Spoil] = {
-    "none": _clean,
+KINDS: Mapping[str, Callable[[Draw], np.ndarray]] = {
+    "none": Draw.noisy,
     "drift": _drift,
     "forcing": _forced,
-    "lag 1": _late(1),
-    "lag 2": _late(2),
-    "clip 90": _clipped(0.9),
-    "clip 80": _clipped(0.8),
-    "4 bits": _rounded(4),
-    "6 bits": _rounded(6),
+    "lag 1": partial(_late, n=1),
+    "lag 2": partial(_late, n=2),
+    "clip 90": partial(_clipped, fraction=0.9),
+    "clip 80": partial(_clipped, fraction=0.8),
+    "4 bits": partial(_rounded, bits=4),
     "outliers": _outliers,
     "multiplicative": _multiplied,
     "AR 0.95": _lasting,
@@ -137,7 +128,7 @@ def spoilt(name: str, kind: str, number: int, noise: float) -> tuple[System, Tra
     """A draw of a system, spoilt."""
     system, clean = noisy(name, 0.0, number)
     rng = np.random.default_rng([number, *kind.encode(), *name.encode()])
-    states = KINDS[kind](system, clean, noise, rng)
+    states = KINDS[kind](Draw(system, clean, noise, rng))
     t = clean.t[len(clean.t) - len(states) :]
     return system, Trajectory(t, states, clean.state_names, label=f"{name}, {kind}")
 
@@ -152,7 +143,6 @@ def main() -> None:
     parser.add_argument("--n", type=int, default=5)
     parser.add_argument("--noise", type=float, default=0.02)
     parser.add_argument("--align", action="store_true", help="bring delayed channels together")
-    parser.add_argument("--words", action="store_true", help="what was stated of doubtful ones")
     asked = parser.parse_args()
     method = ep.TrajectorySearch(align=asked.align)
     total: Counter[str] = Counter()
@@ -162,10 +152,7 @@ def main() -> None:
         for number in range(asked.n):
             system, run = spoilt(name, kind, number, asked.noise)
             found = ep.discover(run, system.model.library, method)
-            what = _what(system, found)
-            counts[what] += 1
-            if asked.words and what not in ("right", "wrong, a lack of fit"):
-                print(f"  {number} {what}: {found.note[:160]} {list(found.data_warnings)}")
+            counts[_what(system, found)] += 1
         total += counts
         cpu_s = (time.process_time() - start) / asked.n
         print(f"{kind:15} {name:16} {_line(counts)}  CPU-s {cpu_s:.2f}", flush=True)

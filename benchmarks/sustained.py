@@ -2,11 +2,11 @@
 
 Equations that conserve what ions and neutrals of the whole channel exchange, as `+exp=breathing`
 finds them: over operating points, splits of the record and seeds, on the default source, on the
-former one, and on `thruster=lif`, whose ions flow back (`lif`, `lif_law_back`, and with 200 cells
-`lif_law_back_fine`); next to free terms, in other zones, in several at once (`several`, `three`),
-in noise, and from the (z, r) simulator. Every model called self-sustained is run again by another
-solver, ten times as long; its processes are compared with the balance of the zone. Prints the
-tables of docs/living.md, or those that are named.
+former one, and on `thruster=lif`, whose ions flow back (`lif_law`, `lif_law_back`, and with 200
+cells `lif_law_back_fine`); in two zones at once (`several`), in noise, and from the (z, r)
+simulator. Every model called self-sustained is run again by another solver, ten times as long; its
+processes are compared with the balance of the zone. Prints the tables of docs/living.md, or those
+that are named.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ from dataclasses import dataclass, replace
 from dataclasses import field as field_of
 from functools import cache, partial
 from itertools import product
-from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -29,26 +28,15 @@ import ep2sindy as ep
 from benchmarks.source import measured_sets
 from ep2sindy.data.sampling import ZoneAverage, side_by_side
 from ep2sindy.library.relations import Constraint
-from ep2sindy.library.roles import fractions_of, sum_known
-from ep2sindy.refinement.refine import with_coef
-from ep2sindy.studies.processes import (
-    ComparedProcess,
-    Zones,
-    compared_processes,
-    ends_of,
-    fitted_rate,
-    recorded_rates,
-    stated_roles,
-)
+from ep2sindy.regression.searches import Search
+from ep2sindy.studies.processes import ComparedProcess, Zones, compared_processes, stated_roles
 from ep2sindy.studies.sustained import start_of
 
 POINTS = {point.label: point for point in ep.thruster.OPERATING_POINTS}
 CHANNEL, DOWNSTREAM = "channel", "downstream"
-ZONES = (CHANNEL, DOWNSTREAM, (0.0, 0.010), (0.005, 0.015), (0.010, 0.020), (0.020, 0.030))
 SPLITS = {"last": (0.0, 0.75), "first": (0.25, 1.0), "second half": (0.0, 0.5)}  # what is fitted
 DRAWS = [(split, seed) for split in SPLITS for seed in range(3)] + [("last", 3)]
 ONCE = [(split, 0) for split in SPLITS]
-N_SEEDS = 1  # in other zones
 NOISES = ((0.2, 6.0), (0.4, 50.0))  # fraction of each state's RMS, periods
 N_NOISE_DRAWS = 3
 LONGER = 10.0  # times the held-out part, for the other solver
@@ -65,11 +53,6 @@ FORMER_SPEED = {"300V_2mgs": 190.0}  # m/s; 280 at the other points
 MASS_ACTION = ep.Roles(
     exchange=[("n_n", "n_i")], outflow=STATES, inflow={"n_n": "known or free"}, nonnegative=True
 )
-MIN_PROBABILITY = replace(
-    MASS_ACTION,
-    exchange=[("n_n", "n_i"), ("n_i", "n_n", "known")],
-    outflow={"n_i": "free", "n_n": "known"},
-)
 # One structure for every point: every term a process, five free coefficients. Nothing but the mass
 # flow is known of the law; of the other one, what leaves as neutrals and comes back, too.
 LAW = replace(
@@ -77,13 +60,13 @@ LAW = replace(
     exchange=[("n_n", "n_i", ["n_i^2*n_n", "n_i*n_n^2"])],
     outflow={"n_i": ["n_i", "n_i^2"], "n_n": ["n_n"]},
 )
-LAW_TOLD = replace(
+LAW_STATED = replace(
     LAW,
     exchange=[("n_n", "n_i", ["n_i*n_n", "n_i^2*n_n", "n_i*n_n^2"]), ("n_i", "n_n", "known")],
     outflow={"n_i": ["n_i", "n_i^2"], "n_n": "known"},
 )
 # Where ions flow back, those that leave go with the neutrals, too.
-LAW_BACK = replace(LAW_TOLD, outflow={"n_i": ["n_i", "n_i^2", "n_i*n_n^2"], "n_n": "known"})
+LAW_BACK = replace(LAW_STATED, outflow={"n_i": ["n_i", "n_i^2", "n_i*n_n^2"], "n_n": "known"})
 LIF, LIF_SPEED = measured_sets()["lif"]
 SETS = {"default": ep.thruster.Thruster(), "former": FORMER, "lif": LIF, "lif_fine": LIF}
 N_CELLS = {"lif_fine": 200}  # at 200 V, 100 cells are too few for cycles of lif that repeat
@@ -188,11 +171,6 @@ def conserving(fitted: ep.Trajectory, whole: Record, *, seed: int) -> ep.Discove
     return under(MASS_ACTION, fitted, whole, seed=seed)
 
 
-def stated(fitted: ep.Trajectory, whole: Record, *, seed: int) -> ep.Discovery:
-    """The same where what the record tells is known: `sustained=stated`."""
-    return under(MIN_PROBABILITY, fitted, whole, seed=seed)
-
-
 class AllTerms:
     """A search that proposes all terms."""
 
@@ -211,7 +189,7 @@ def under(
     whole: Record,
     *,
     seed: int,
-    search: Any = None,
+    search: Search | None = None,
 ) -> ep.Discovery:
     """A search over the whole channel under roles, whose known parts are those of the record."""
     method = ep.Regression(
@@ -232,16 +210,15 @@ def known_of(fitted: ep.Trajectory, whole: Record) -> dict[str, dict[str, float]
 
 
 def by_neighbourhood(fitted: ep.Trajectory, whole: Record, *, seed: int) -> ep.Discovery:
-    """Several zones under the roles of `+exp=zones`: up to 14 free coefficients, 20 for three."""
-    two = len(whole.sizes) == 2
+    """Two zones under the roles of `+exp=zones`: up to 14 free coefficients."""
     roles = ep.Roles(exchange=[("n_n", "n_i")], outflow=STATES, inflow={"n_n": "known"})
     roles = roles.in_zones(whole.sizes).with_known(known_of(fitted, whole))
     library = ep.polynomial(fitted.state_names, degree=3).with_roles(roles)
     method = ep.Regression(
         ep.Differential(),
-        ep.BestSubset(max_terms=14 if two else 20, n_best=200 if two else 1000),
+        ep.BestSubset(max_terms=14, n_best=200),
         ep.FreeRunScore(seed=seed, window_periods=8.0),
-        depth=6 if two else 4,
+        depth=6,
     )
     return ep.discover([fitted], library, method, seed=seed)
 
@@ -353,18 +330,22 @@ def structures(cases: Sequence[Case]) -> str:
     return "\n".join(f"    {n} x {terms}" for terms, n in found.most_common())
 
 
-def print_points(
-    name: str = "default", search: Callable = conserving, draws: Sequence[tuple[str, int]] = DRAWS
-) -> None:
+def print_points(name: str = "default", draws: Sequence[tuple[str, int]] = DRAWS) -> None:
     """Six operating points, the whole channel."""
-    words = "equations that conserve" if search is conserving else "free terms"
-    print(f"\n{name} source, whole channel, {words}: median / worst of {len(draws)} draws")
+    print(f"\n{name} source, whole channel: median / worst of {len(draws)} draws")
+    print_cases([record(label, CHANNEL, name) for label in oscillating(name)], draws, conserving)
+
+
+def print_cases(
+    wholes: Sequence[Record], draws: Sequence[tuple[str, int]], search: Callable[..., ep.Discovery]
+) -> None:
+    """Every point, and all of them."""
     everything = []
-    for label in oscillating(name):
-        whole = record(label, CHANNEL, name)
+    for whole in wholes:
         cases = [case(*parts(whole.run, s), whole, seed=seed, search=search) for s, seed in draws]
         everything += cases
-        print("\n".join([line(label, cases), balances(cases), structures(cases)]), flush=True)
+        words = line(whole.run.label, cases)
+        print("\n".join([words, balances(cases), structures(cases)]), flush=True)
     print(line("all", everything))
 
 
@@ -373,82 +354,24 @@ def print_law(roles: ep.Roles, name: str = "default") -> None:
     print(f"\n{roles.exchange}, {roles.outflow}; coefficients over the record's: medians of splits")
     search = partial(law, roles=roles)
     for label in oscillating(name):
-        whole, ratios, cases, verdicts = record(label, CHANNEL, name), [], [], []
+        whole, ratios, cases = record(label, CHANNEL, name), [], []
         for split, seed in ONCE:
             cases.append(case(*parts(whole.run, split), whole, seed=seed, search=search))
             found = search(parts(whole.run, split)[0], whole, seed=seed)
             compared = whole.processes(found.model, found.constraint)
-            pairs = [(p.coef[term], p.counterpart[term]) for p in compared for term in p.coef]
-            ratios.append([model / recorded for model, recorded in pairs])
-            run = by_the_record(found, compared, parts(whole.run, split)[1])
-            verdicts.append(f"{run.status}, f {run.f_error:+.0%}")
+            ratios.append([p.coef[term] / p.counterpart[term] for p in compared for term in p.coef])
         medians = ", ".join(f"{ratio:.2f}" for ratio in np.median(ratios, axis=0))
         print("\n".join([line(label, cases), balances(cases), f"    {medians}"]), flush=True)
-        print(f"    with the record's own coefficients: {verdicts[0]}", flush=True)
         for each in (c for c in cases if c.run.status is not ep.model.Status.SUSTAINED):
             off = f"f {each.run.f_error:+.2%}, amplitude {each.amplitude:.1%}"
             print(f"    {each.run.text}: {off}, waveform {each.waveform:.3f}")
-        spread = 100.0 * field(label, name).attrs["peak_spread"]
-        print(f"    peaks of the record's current vary by {spread:.1f} %", flush=True)
 
 
-def by_the_record(
-    found: ep.Discovery, compared: Sequence[ComparedProcess], assessed: ep.Trajectory
-) -> ep.model.Evaluation:
-    """The terms of a model with the coefficients of the record, run freely."""
-    held, model = found.constraint, found.model
-    assert held is not None
-    recorded = {(p.ends, term): value for p in compared for term, value in p.counterpart.items()}
-    values = [recorded[ends_of(process), process.term] for process in held.processes]
-    known = sum_known(held.known)
-    stated = [known.get(held.coefficients[k], 0.0) for k in held.free]
-    coef = held.coef(fractions_of(held) @ np.array(values) + stated)
-    changed = with_coef(model, held, coef)[0]
-    return ep.evaluate(changed, assessed, initial=start_of(assessed, model))
-
-
-def print_profiles() -> None:
-    """Ionization in the channel by the product of the means: least squares, and R2.
-
-    The mean of a product is not the product of the means: the factor is that of the profiles.
-    """
-    print("\nionization = eps <n_i> <n_n> <R_ion> over the whole channel")
-    for label in POINTS:
-        zone = ep.Zone(z=CHANNEL)
-        run = ep.zone_average(field(label), zone, states=(*STATES, "R_ion"), label=label)
-        rate = recorded_rates(record(label).balances[""], run)["ionization"]
-        found = fitted_rate(rate, run.states.prod(axis=1)[:, None], ["n_i*n_n*R_ion"])
-        print(f"{label:24s} eps {found.terms['n_i*n_n*R_ion']:.2f}, R2 {found.r2:.3f}", flush=True)
-
-
-def print_several(n_zones: int, draws: Sequence[tuple[str, int]], name: str = "default") -> None:
-    """Six operating points, the channel cut into zones of equal length."""
-    print(f"\n{n_zones} zones, equations that conserve: median / worst of {len(draws)} draws")
-    everything = []
-    for label in oscillating(name):
-        whole = zones_record(label, n_zones, name)
-        cases = [
-            case(*parts(whole.run, s), whole, seed=seed, search=by_neighbourhood)
-            for s, seed in draws
-        ]
-        everything += cases
-        print("\n".join([line(label, cases), balances(cases), structures(cases)]), flush=True)
-    print(line("all", everything))
-
-
-def print_zones(name: str = "default") -> None:
-    """Six operating points, other zones: free terms, since no inflow is known."""
-    print(f"\n{name}, by zone, free terms: median / worst of the points and {N_SEEDS} seeds")
-    labels = oscillating(name)
-    for z in ZONES:
-        wholes = [record(label, z, name) for label in labels]
-        cases = [
-            case(*parts(whole.run, "last"), whole, seed=seed, search=free)
-            for whole in wholes
-            for seed in range(N_SEEDS)
-        ]
-        words = z if isinstance(z, str) else f"{1e3 * z[0]:g} to {1e3 * z[1]:g} mm"
-        print(line(words, cases), flush=True)
+def print_several(draws: Sequence[tuple[str, int]], name: str = "default") -> None:
+    """Six operating points, the channel cut into two zones of equal length."""
+    print(f"\n{name} source, two zones: median / worst of {len(draws)} draws")
+    wholes = [zones_record(label, 2, name) for label in oscillating(name)]
+    print_cases(wholes, draws, by_neighbourhood)
 
 
 def noisy(run: ep.Trajectory, fraction: float, n_periods: float, *, seed: int) -> ep.Trajectory:
@@ -493,8 +416,8 @@ def print_plane() -> None:
         ep.zone_average(run, zone, states=STATES, label="plane"),
         {"": ep.thruster.zone_balance(run, zone)},
     )
-    for split in SPLITS:
-        cases = [case(*parts(whole.run, split), whole, seed=seed) for seed in range(N_SEEDS)]
+    for split, seed in ONCE:
+        cases = [case(*parts(whole.run, split), whole, seed=seed)]
         print("\n".join([line(split, cases), balances(cases), structures(cases)]), flush=True)
 
 
@@ -503,21 +426,13 @@ def main() -> None:
     tables: dict[str, Callable[[], None]] = {
         "points": print_points,
         "law": lambda: print_law(LAW),
-        "law_told": lambda: print_law(LAW_TOLD),
-        "law_back": lambda: print_law(LAW_BACK),
-        "profiles": print_profiles,
-        "former": lambda: print_points("former", draws=ONCE),
-        "lif": lambda: print_points("lif", search=stated, draws=ONCE),
+        "law_stated": lambda: print_law(LAW_STATED),
+        "former": lambda: print_points("former", ONCE),
         "lif_law": lambda: print_law(LAW, "lif"),
-        "lif_law_told": lambda: print_law(LAW_TOLD, "lif"),
         "lif_law_back": lambda: print_law(LAW_BACK, "lif"),
         "lif_law_back_fine": lambda: print_law(LAW_BACK, "lif_fine"),
-        "lif_zones": lambda: print_zones("lif"),
-        "lif_several": lambda: print_several(2, [("last", 0)], "lif"),
-        "free": lambda: print_points(search=free),
-        "zones": print_zones,
-        "several": lambda: print_several(2, ONCE),
-        "three": lambda: print_several(3, [("last", 0)]),
+        "lif_several": lambda: print_several([("last", 0)], "lif"),
+        "several": lambda: print_several(ONCE),
         "noise": print_noise,
         "plane": print_plane,
     }

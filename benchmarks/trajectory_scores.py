@@ -1,6 +1,6 @@
 """Selecting by trajectories: refined and free, and by EBIC next to them.
 
-    python -m benchmarks.trajectory_scores --n 12 [--systems lotka_volterra lorenz] [--rules EBIC]
+    python -m benchmarks.trajectory_scores [--n 12]
 
 Realizations of four systems as the synthetic benchmark draws them; weighted weak form,
 the two best subsets of every size up to four terms, depth 2.
@@ -8,7 +8,6 @@ the two best subsets of every size up to four terms, depth 2.
 
 import argparse
 import time
-from collections.abc import Sequence
 from functools import partial
 from itertools import product
 
@@ -34,7 +33,7 @@ RULES: dict[str, Selection] = {
 }
 
 
-def assessed(number: int, *, name: str, noise: float, rules: Sequence[str]) -> dict[str, float]:
+def assessed(number: int, *, name: str, noise: float) -> dict[str, float]:
     """Was the truth on the fronts, and which rule selected all of it? CPU seconds of each.
 
     A rule selects in vain where the truth is not there, and is not asked.
@@ -54,27 +53,24 @@ def assessed(number: int, *, name: str, noise: float, rules: Sequence[str]) -> d
         for front, terms in zip(fronts, truth, strict=True)
     )
     row = {"on the front": float(there)}
-    for rule in rules if there else ():
+    for label, rule in RULES.items() if there else ():
         begin = time.process_time()
-        scores = RULES[rule].decide(fronts, DiscoveryProblem(runs, system.model.library)).scores
-        row[f"{rule}, s"] = time.process_time() - begin
+        scores = rule.decide(fronts, DiscoveryProblem(runs, system.model.library)).scores
+        row[f"{label}, s"] = time.process_time() - begin
         chosen = [set(f.with_scores(s).best.terms) for f, s in zip(fronts, scores, strict=True)]
-        row[rule] = float(chosen == truth)
+        row[label] = float(chosen == truth)
     return row
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="selection by trajectories")
     parser.add_argument("--n", type=int, default=12, help="realizations per system and noise")
-    parser.add_argument("--systems", nargs="*", default=SYSTEMS, help="of these four")
-    parser.add_argument("--rules", nargs="*", default=list(RULES), help="of these three")
-    given = parser.parse_args()
-    n, rules = given.n, given.rules
-    for name, noise in product(given.systems, NOISES):
-        assess = partial(assessed, name=name, noise=noise, rules=rules)
+    n = parser.parse_args().n
+    for name, noise in product(SYSTEMS, NOISES):
+        assess = partial(assessed, name=name, noise=noise)
         table = pd.DataFrame([row for _, row in Loky().run(assess, range(n))])
-        counts = ", ".join(f"{key} {table[key].sum():.0f}" for key in ("on the front", *rules))
-        cost = ", ".join(f"{rule} {table[f'{rule}, s'].mean():.2g} s" for rule in rules)
+        counts = ", ".join(f"{key} {table[key].sum():.0f}" for key in ("on the front", *RULES))
+        cost = ", ".join(f"{rule} {table[f'{rule}, s'].mean():.2g} s" for rule in RULES)
         print(f"{name}, {noise:.0%}: of {n}, {counts}; CPU: {cost}", flush=True)
 
 

@@ -7,7 +7,6 @@ import torch
 from scipy.integrate import solve_ivp
 
 import ep2sindy as ep
-from benchmarks.nelder_mead import NelderMead
 from benchmarks.refine import START, STATES, TRUTH, breathing_states, contaminated
 from ep2sindy.refinement.assess import is_stationary
 from ep2sindy.refinement.methods.gradient_descent import GradientDescent
@@ -84,8 +83,6 @@ def test_methods_agree_on_the_minimiser() -> None:
         other = fitted(SingleShooting(), free_start=free_start)
         assert other.status == "converged"
         np.testing.assert_allclose(other.model.coef, best.model.coef, rtol=1e-7)
-    other = fitted(NelderMead(tolerance=1e-3), free_start=False)
-    assert other.loss == pytest.approx(best.loss, rel=1e-4)
 
 
 @pytest.mark.slow  # torch.optim imports torch's compiler: five seconds

@@ -10,7 +10,7 @@ import pytest
 
 import ep2sindy as ep
 from benchmarks import known_laws
-from benchmarks.breathing_family import LIBRARY, PARAMETERS, TRUTH, realization, system_at
+from benchmarks.points import LIBRARY, PARAMETERS, TRUTH, realization, system_at
 from ep2sindy.regression.rows import Formulation, RegressionRows
 from ep2sindy.selection.criteria import Selection, log_supports
 from tests.models import plain_rows
