@@ -154,9 +154,8 @@ def sweep_folder() -> Path | None:
 
 def job_errors(sweep: Path) -> list[str]:
     """Print and return the errors in the records of jobs that ran in other processes."""
-    records = {
-        path.stem: read_json(path.read_text("utf-8")) for path in sweep.glob(f"{JOBS}/*.json")
-    }
+    paths = {int(path.stem): path for path in sweep.glob(f"{JOBS}/*.json")}
+    records = {job: read_json(paths[job].read_text("utf-8")) for job in sorted(paths)}
     errors = {job: record["error"] for job, record in records.items() if "error" in record}
     for job, error in errors.items():
         say(f"job {job} failed: {error}")

@@ -108,14 +108,13 @@ class TrialSystem:
     def refine_on_all(
         self, runs: Sequence[Trajectory], seed: int, **settings: Unpack[RefinementChanges]
     ) -> SparseModel:
-        """Refine on windows spread over all the data, with the covariance of the coefficients.
+        """Refine on windows spread over all the data, by torchdiffeq, with the covariance.
 
         seed and settings: as for `refine`. A system without free coefficients, or one whose
         refinement does not stay finite, is returned unchanged, without covariance.
         """
         if not len(self.constraint.free):
             return self.model
-        settings["method"] = MultipleShooting(step=fastest_step(self.model.library))
         settings["constraint"] = self.constraint
         return refine(self.model, runs, seed=seed, **settings).model
 
