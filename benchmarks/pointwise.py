@@ -27,7 +27,7 @@ from ep2sindy.regression.bootstraps import Bootstraps
 from ep2sindy.regression.formulations import Differential
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.searches import BestSubset
-from ep2sindy.runtime.parallel import ONE_BY_ONE
+from ep2sindy.runtime.parallel import ONE_BY_ONE, Workers
 from ep2sindy.selection.criteria import Knee
 
 N_Z, N_R, N_SAMPLES, DT_S = 41, 49, 12001, 1.5e-6
@@ -47,10 +47,12 @@ SEARCH = PointSearch(
 )
 
 
-def write_grid(path: Path, rng: np.random.Generator) -> None:
+def write_grid(
+    path: Path, rng: np.random.Generator, n_z: int = N_Z, n_r: int = N_R, n_samples: int = N_SAMPLES
+) -> None:
     """Oscillations of 14 kHz and its harmonic with 2 % noise, different at every point."""
-    t = np.arange(N_SAMPLES) * DT_S
-    axes = {"time": t, "z": np.linspace(0.0, 0.05, N_Z), "r": np.linspace(0.028, 0.057, N_R)}
+    t = np.arange(n_samples) * DT_S
+    axes = {"time": t, "z": np.linspace(0.0, 0.05, n_z), "r": np.linspace(0.028, 0.057, n_r)}
     with netCDF4.Dataset(path, "w") as file:
         for axis, points in axes.items():
             file.createDimension(axis, len(points))
@@ -60,8 +62,8 @@ def write_grid(path: Path, rng: np.random.Generator) -> None:
         for name, unit in UNITS.items():
             variable = file.createVariable(name, "f8", tuple(axes), contiguous=True)
             variable.units = unit
-            phase, strength = rng.uniform(0.0, 2 * np.pi, (2, N_Z, N_R)), rng.uniform(0.2, 0.6, 2)
-            for start in range(0, N_SAMPLES, 1000):
+            phase, strength = rng.uniform(0.0, 2 * np.pi, (2, n_z, n_r)), rng.uniform(0.2, 0.6, 2)
+            for start in range(0, n_samples, 1000):
                 turn = 2 * np.pi * 14e3 * t[start : start + 1000, None, None]
                 wave = sum(
                     a * np.sin(k * turn + p)
@@ -71,8 +73,8 @@ def write_grid(path: Path, rng: np.random.Generator) -> None:
                 variable[start : start + 1000] = LEVELS[name] * (1.0 + wave + noise)
 
 
-def study(field: xr.Dataset) -> xr.Dataset:
-    return pointwise(field, SEARCH, workers=ONE_BY_ONE, block_points=BLOCK_POINTS)
+def study(field: xr.Dataset, workers: Workers = ONE_BY_ONE) -> xr.Dataset:
+    return pointwise(field, SEARCH, workers=workers, block_points=BLOCK_POINTS)
 
 
 def rows_at(field: xr.Dataset, iz: int, ir: int) -> RegressionRows:

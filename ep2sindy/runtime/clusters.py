@@ -5,12 +5,21 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 from joblib import parallel_config
 
-from ep2sindy.runtime.parallel import Function, Part, Results, check_part, run_in_joblib
+from ep2sindy.runtime.parallel import (
+    Function,
+    Part,
+    Results,
+    check_part,
+    in_worker,
+    run_in_joblib,
+    with_its_code,
+)
 from ep2sindy.runtime.values import check_positive
 
 
@@ -55,10 +64,24 @@ class Dask:
         check_positive("wait_s", self.wait_s)
 
     def run(self, function: Function, pieces: Iterable[Any], n_alike: int | None = None) -> Results:
+        # Not by joblib's backend: with one thread at the start, as when the first of many workers
+        # has just joined, it would do all pieces in this process, and it sends none to later ones.
+        numbered = enumerate(pieces)
         with _client(self) as client:
-            with parallel_config("dask", client=client):
-                results = run_in_joblib(function, pieces, n_jobs=-1)
-            yield from results
+            from distributed import as_completed
+
+            code, sent = with_its_code(function), as_completed(loop=client.loop)
+
+            def send() -> None:
+                """Give every thread of the cluster a piece to work on, and one that waits."""
+                n_free = 2 * sum(client.ncores().values()) - sent.count()
+                for piece in islice(numbered, max(0, n_free)):
+                    sent.add(client.submit(in_worker, code, None, piece, pure=False))
+
+            send()
+            for future in sent:
+                yield future.result()
+                send()
 
 
 @contextmanager

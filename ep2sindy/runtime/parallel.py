@@ -124,7 +124,7 @@ def rows_in_order(
     return [row for rows in found for row in rows]
 
 
-def _in_worker(code: bytes, parent: int | None, numbered: Numbered) -> Numbered:
+def in_worker(code: bytes, parent: int | None, numbered: Numbered) -> Numbered:
     """Result of a piece. parent: the program whose end is the worker's; None for any other worker.
 
     Workers of a cluster, for example, have been started by somebody else and serve other programs.
@@ -137,7 +137,7 @@ def _in_worker(code: bytes, parent: int | None, numbered: Numbered) -> Numbered:
     return _on_one_thread(pickle.loads(code), numbered)
 
 
-def _with_its_code(function: Function) -> bytes:
+def with_its_code(function: Function) -> bytes:
     """Pickle a function with the code of the modules in the folder of the run that configs name."""
     for package in own_packages():
         cloudpickle.register_pickle_by_value(package)
@@ -160,8 +160,8 @@ def run_in_joblib(function: Function, pieces: Iterable[Any], *, n_jobs: int | No
     kind = "generator_unordered" if as_they_come else "list"
     workers = Parallel(n_jobs=n_jobs, return_as=kind, max_nbytes=None)
     parent = os.getpid() if is_local() else None
-    code, numbered = _with_its_code(function), enumerate(pieces)
-    return iter(workers(delayed(_in_worker)(code, parent, each) for each in numbered))
+    code, numbered = with_its_code(function), enumerate(pieces)
+    return iter(workers(delayed(in_worker)(code, parent, each) for each in numbered))
 
 
 @dataclass(frozen=True)
