@@ -19,6 +19,7 @@ import cloudpickle
 from joblib import Memory, Parallel, delayed, effective_n_jobs
 
 from ep2sindy.runtime.progress import SILENT, Progress
+from ep2sindy.runtime.screen import SAID
 from ep2sindy.runtime.threads import one_thread
 from ep2sindy.trust.interruption import end_with
 from ep2sindy.trust.user_code import own_packages
@@ -106,7 +107,13 @@ def _with_its_code(function: Function) -> bytes:
     """Pickle a function with the code of the modules in the folder of the run that configs name."""
     for package in own_packages():
         cloudpickle.register_pickle_by_value(package)
-    return cloudpickle.dumps(function)
+    return cloudpickle.dumps(partial(_unrepeated, frozenset(SAID), function))
+
+
+def _unrepeated(said: frozenset[str], function: Function, piece: Any) -> Any:
+    """Do a piece without saying what the program has said."""
+    SAID.update(said)
+    return function(piece)
 
 
 @dataclass(frozen=True)
