@@ -105,12 +105,41 @@ def kernels(tmp_path: Path) -> Path:
     return folder
 
 
+def homeless(folder: Path) -> dict[str, str]:
+    """The environment of a user without a home, whom the system does not know either."""
+    (folder / "sitecustomize.py").write_text("import pwd\npwd.getpwuid = {}.__getitem__\n")
+    return {"PYTHONPATH": f"{folder}{os.pathsep}{compilation.PACKAGE.parent}"}
+
+
+NO_HOME = compilation.not_kept(
+    OSError("this user has no home folder; EP2SINDY_CACHE names a folder")
+)
+
+
+def test_a_user_without_a_home_can_call_kernels(kernels: Path) -> None:
+    run = called(kernels, env=homeless(kernels))
+    assert (run.stdout, run.stderr) == ("5.0\n", f"{compilation.ANNOUNCEMENT}\n{NO_HOME}\n")
+
+
 def test_a_kernel_that_does_not_fit_on_the_disk_is_compiled(kernels: Path, tmp_path: Path) -> None:
     full = "import resource\nresource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))\n"
     run = called(kernels, "-c", full + CALL, str(kernels), EP2SINDY_CACHE=str(tmp_path / "cache"))
     assert run.stdout == "5.0\n"
     assert run.stderr.count("\n") == 2
     assert "ep2sindy: compiled kernels are not kept: " in run.stderr
+
+
+@pytest.mark.slow
+def test_a_program_without_a_home_says_once_that_nothing_is_kept(tmp_path: Path) -> None:
+    """Two workers compile too, and say nothing."""
+    study = (
+        "+exp=benchmark variants=[ours] systems=[lotka_volterra] n_realizations=1 parallel.n_jobs=2"
+    )
+    command = ["-m", "ep2sindy.app.main", *study.split(), f"output={tmp_path}"]
+    run = called(tmp_path, *command, env=homeless(tmp_path))
+    assert "Found: ours, selected exactly right" in run.stdout
+    said = [line for line in run.stderr.splitlines() if line.startswith("ep2sindy: ")]
+    assert said == [compilation.ANNOUNCEMENT, NO_HOME]
 
 
 def test_a_kernel_is_kept_where_one_may_write_and_follows_what_it_calls(
