@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import ep2sindy as ep
-from ep2sindy.data.coerce import DiscoveryProblem
+from ep2sindy.data.coerce import DiscoveryProblem, FailedTryError
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import _hidden_names
 from ep2sindy.estimation import estimate, explanation
@@ -170,6 +170,23 @@ def test_only_positive_states_have_growth_rates_which_come_first() -> None:
         assert ways[0].term == first
         assert known.facts.only == {"x": (first,)}
         assert known.hidden == ()
+
+
+def test_a_guess_outside_the_domain_of_a_function_is_a_way_that_failed() -> None:
+    library = ep.polynomial(["x", "g"], functions=["log(g)"])
+    with pytest.raises(FailedTryError, match=r"no guess of the hidden states: log\(g\) needs"):
+        list(with_guesses(DiscoveryProblem([only("x")], library, hidden=["g"])))
+
+
+def test_a_hidden_state_that_rests_is_a_try_that_failed() -> None:
+    """Of a map no flow is a model: the last state comes to rest along with its equations."""
+    x = [0.36]
+    for _ in range(79):
+        x.append(3.9 * x[-1] * (1.0 - x[-1]))
+    run = Trajectory(np.arange(80.0), np.array(x)[:, None], ["x"])
+    library = ep.polynomial(["x", "g", "h"], degree=2)
+    with pytest.raises(FailedTryError, match="no states fit the data: a state must vary: 'h'"):
+        ep.estimate(run, library, hidden=["g", "h"])
 
 
 @pytest.mark.slow

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.interpolate import make_interp_spline
 
-from ep2sindy.data.coerce import DiscoveryProblem
+from ep2sindy.data.coerce import DiscoveryProblem, FailedTryError, check_domain, own_result
 from ep2sindy.data.numbers import least_squares
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library
@@ -103,7 +103,8 @@ def with_guesses(
 ) -> Iterator[list[tuple[DiscoveryProblem, tuple[Coupling, ...]]]]:
     """Tasks without hidden states, one for every way in: guesses stand among the samples.
 
-    They come in groups, the most natural first; the next group counts if no way of it fits. A
+    They come in groups, the most natural first; the next group counts if no way of it fits. Ways
+    without a guess that the library can be evaluated at are left out. A
     single measured state that is positive has a growth rate, whose equation keeps it positive; one
     that takes either sign has a rate, for no growth rate would let it through zero.
     """
@@ -116,8 +117,19 @@ def with_guesses(
         groups = sorted(groups, key=lambda ways: ways[0][0].term == task.hidden[0])
     else:
         groups = [ways for ways in groups if ways[0][0].term == task.hidden[0]] or groups
+    failed, any_guess = FailedTryError(), False
     for group in groups:
-        yield [(_insert_guesses(task, ways), ways) for ways in group]
+        tasks = []
+        for ways in group:
+            try:
+                tasks.append((_insert_guesses(task, ways), ways))
+            except FailedTryError as error:
+                failed = error
+        if tasks:
+            any_guess = True
+            yield tasks
+    if not any_guess:
+        raise failed
 
 
 def _insert_guesses(task: DiscoveryProblem, ways: Sequence[Coupling]) -> DiscoveryProblem:
@@ -129,7 +141,10 @@ def _insert_guesses(task: DiscoveryProblem, ways: Sequence[Coupling]) -> Discove
     library = task.library.relate(*(way.relation for way in ways if not way.given))
     if len(task.runs[0].state_names) == 1 and first.state not in task.facts.only:
         library = library.only({first.state: (first.term,)})
-    return DiscoveryProblem([with_guess(run, library, ways) for run in task.runs], library)
+    with own_result("no guess of the hidden states"):
+        guessed = DiscoveryProblem([with_guess(run, library, ways) for run in task.runs], library)
+        check_domain(guessed.runs, library, smooth=True)
+    return guessed
 
 
 def with_guess(run: Trajectory, library: Library, ways: Sequence[Coupling]) -> Trajectory:
@@ -220,12 +235,13 @@ def _quotient(
 def _insert_states(run: Trajectory, known: Columns, units: Mapping[str, str]) -> Trajectory:
     """The run with more states; those that were measured as they were."""
     more = [name for name in known if name not in run.names]
-    return replace(
-        run,
-        states=np.column_stack([run.states, *(known[name] for name in more)]),
-        state_names=(*run.state_names, *more),
-        units=units,
-    )
+    with own_result(f"no guess of {', '.join(more)}"):
+        return replace(
+            run,
+            states=np.column_stack([run.states, *(known[name] for name in more)]),
+            state_names=(*run.state_names, *more),
+            units=units,
+        )
 
 
 def _linear_in(library: Library, name: str, others: Sequence[str]) -> Bool[np.ndarray, " terms"]:

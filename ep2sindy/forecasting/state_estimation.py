@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ep2sindy.data.coerce import own_result
 from ep2sindy.data.runs import Run, trajectory_of
 from ep2sindy.data.sensor import Bounds
 from ep2sindy.data.trajectory import Trajectory
@@ -151,7 +152,8 @@ class StateEstimator:
         paths = [self.fit_path(piece, piece.samples).path for piece in pieces]
         kept = np.isin(whole.times, np.concatenate([piece.times for piece in pieces]))
         states = np.concatenate(paths) * self.problem.scale
-        return replace(own, t=own.t[kept], states=states, inputs=own.inputs[kept])
+        with own_result("the model does not follow the record"):
+            return replace(own, t=own.t[kept], states=states, inputs=own.inputs[kept])
 
     def with_process_noise(self, factor: float) -> StateEstimator:
         """The same with process noise that is larger by a factor."""
