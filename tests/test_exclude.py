@@ -70,6 +70,46 @@ def test_what_cannot_be_known_is_refused(know: Callable[[], object], message: st
         know()
 
 
+A, B = {"1": 2.0}, {"a": 3.0}
+ROLES = ep.Roles(outflow=["x"])
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "lines"),
+    [
+        (("known", {"x": {"x": A}}), ("known", {"x": {"x*y": B}, "y": {"y": A}}),
+         ["x: x by the point", "x: x*y by the point", "y: y by the point"]),
+        (("known", {"x": {"x": A}}), ("known", {"x": {"x": A}}), ["x: x by the point"]),
+        (("known", {"x": {"x": A}}), ("known", {"x": {"x": B}}),
+         r"coefficient x: x must be given once, got \{'1': 2.0\} and \{'a': 3.0\}"),
+        (("only", {"x": ["x", "y"]}), ("only", {"x": ["y", "x"]}), ["x' has x, y"]),
+        (("only", {"x": ["x"]}), ("only", {"y": ["y"]}), ["x' has x", "y' has y"]),
+        (("only", {"x": ["x"]}), ("only", {"x": ["y"]}),
+         r"the terms of 'x' must be given once, got \('x',\) and \('y',\)"),
+        (("exclude", {"x": ["x^2"]}), ("exclude", {"x": ["x^2", "y"]}), ["x' has no x^2, y"]),
+        (("relate", "x: x == 2 * y: y"), ("relate", "x:x == 2*y:y"), ["x: x == 2 * y: y"]),
+        (("with_roles", ROLES), ("with_roles", ep.Roles(outflow=["x"])), [repr(ROLES)]),
+        (("with_roles", ROLES), ("with_roles", ep.Roles(outflow=["y"])), "roles must be given"),
+        (("with_roles", ROLES), ("with_roles", None), []),
+        (("known", {"x": 2.0}), None, r"a sum of functions .*, got \{'x': 2.0\}"),
+    ],
+)  # fmt: skip
+def test_what_is_known_twice_holds_once_or_is_refused(
+    first: tuple, second: tuple | None, lines: list[str] | str
+) -> None:
+    def know() -> ep.Library:
+        library = LIBRARY
+        for how, what in [call for call in (first, second) if call]:
+            library = getattr(library, how)(what)
+        return library
+
+    if isinstance(lines, list):
+        assert know().facts.lines == lines
+    else:
+        with pytest.raises(ValueError, match=lines):
+            know()
+
+
 def test_a_config_excludes_terms(tmp_path) -> None:
     RUN.to_dataframe().to_csv(tmp_path / "run.csv")
     given = (

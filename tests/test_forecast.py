@@ -287,8 +287,27 @@ def test_a_model_that_runs_away_forecasts_without_breaking() -> None:
     end = tune_estimator(wild, run).filter(run)
     assert np.isfinite(end.mean).all()
     assert np.isfinite(end.covariance).all()
-    ahead = ep.forecast(wild, run, 0.05, n_draws=10)
-    assert ahead.diverged > 0.5
+    with pytest.raises(ValueError, match="all 10 runs of the model diverge within 0.0033"):
+        ep.forecast(wild, run, 0.05, n_draws=10)
+
+
+@pytest.mark.usefixtures("few_starts")
+@pytest.mark.parametrize("n", [60, pytest.param(1000, marks=pytest.mark.slow)])
+def test_a_history_of_pulses_forecasts_what_follows_however_long_it_is(n: int) -> None:
+    """The square of Lorenz' x, a laser's intensity, nine samples a pulse: pulses are no noise."""
+    laws = {
+        "u": {"p": 20.0, "u": -20.0},  # p = x y, q = y^2
+        "p": {"q": 10.0, "p": -11.0, "u": 28.0, "u*z": -1.0},
+        "q": {"p": 56.0, "p*z": -2.0, "q": -2.0},
+        "z": {"p": 1.0, "z": -8.0 / 3.0},
+    }
+    model = model_of(laws)
+    full = model.simulate(0.08 * np.arange(1010), [1.0, 2.0, 4.0, 20.0]).states
+    scale = full.std(axis=0)
+    u = full[:1000, :1] + 0.01 * scale[0] * np.random.default_rng(0).standard_normal((1000, 1))
+    end = Trajectory(0.08 * np.arange(1000 - n, 1000), u[-n:], ["u"])
+    ahead = ep.forecast(model, end, 0.48, n_draws=20)
+    assert np.abs((ahead.states - full[1000:1006]) / scale).max() < 0.02
 
 
 @pytest.mark.slow

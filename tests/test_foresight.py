@@ -1,9 +1,12 @@
 """How far signals can be foreseen, and what is searched and chosen in them therefore."""
 
+from typing import NoReturn
+
 import numpy as np
 import pytest
 
 import ep2sindy as ep
+from ep2sindy.data.coerce import FailedTryError
 from ep2sindy.discovery.foresight import is_linear
 from ep2sindy.discovery.one_signal import Preparation, StatedFacts, try_in_turn
 from ep2sindy.signals.signal import Signal, prepare_signal
@@ -57,6 +60,20 @@ def test_a_positive_signal_that_is_linear_has_a_derivative_and_no_rate() -> None
     (attempt,) = try_in_turn(positive, [Preparation("auto")], QUICK)
     assert attempt.preparation == Preparation("derivative", degree=1)
     assert attempt.is_damped_line
+
+
+class Failing(Preparation):
+    def search(self, *args: object, **settings: object) -> NoReturn:
+        raise FailedTryError("no states fit the data")
+
+
+def test_a_try_that_fails_leaves_the_others() -> None:
+    signal, failing = trace_of(line_in_noise()), Failing("hidden")
+    tried = [failing, Preparation("derivative", degree=1)]
+    (attempt,) = try_in_turn(signal, tried, QUICK, linear=False)
+    assert attempt.preparation == tried[1]
+    with pytest.raises(FailedTryError, match="no states fit the data"):
+        try_in_turn(signal, [failing], QUICK, linear=False)
 
 
 def test_what_is_stated_holds_in_the_library_of_every_preparation_that_has_it() -> None:

@@ -7,15 +7,21 @@ import numpy as np
 import pytest
 
 import ep2sindy as ep
-from ep2sindy.data.coerce import DiscoveryProblem
+from ep2sindy.data.coerce import DiscoveryProblem, FailedTryError
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import _hidden_names
 from ep2sindy.estimation import estimate, explanation
 from ep2sindy.estimation.explanation import Explanation
-from ep2sindy.estimation.hidden import Coupling, couplings, with_guess, with_guess_by, with_guesses
+from ep2sindy.estimation.hidden import (
+    Coupling,
+    couplings,
+    with_guess,
+    with_guesses,
+    with_guesses_by,
+)
 from ep2sindy.estimation.likelihood import TrajectoryFit, hessian_on, observe
 from ep2sindy.estimation.noise import noise_beside
-from ep2sindy.estimation.problem import EstimationProblem, scale_problem
+from ep2sindy.estimation.problem import EstimationProblem, by_run, scale_problem
 from ep2sindy.estimation.solver import MAX_HIDDEN_DEFECT, hidden_defects
 from tests.programs import composed, computed
 
@@ -172,6 +178,22 @@ def test_only_positive_states_have_growth_rates_which_come_first() -> None:
         assert known.hidden == ()
 
 
+def test_a_guess_outside_the_domain_of_a_function_is_a_way_that_failed() -> None:
+    library = ep.polynomial(["x", "g"], functions=["log(g)"])
+    with pytest.raises(FailedTryError, match=r"no guess of the hidden states: log\(g\) needs"):
+        list(with_guesses(DiscoveryProblem([only("x")], library, hidden=["g"])))
+
+
+def test_a_hidden_state_that_rests_is_a_try_that_failed(monkeypatch: pytest.MonkeyPatch) -> None:
+    def at_rest(problem: EstimationProblem, paths: list[np.ndarray], runs: list[Trajectory]) -> Any:
+        return by_run(problem, [np.where(problem.measured, path, 1.0) for path in paths], runs)
+
+    monkeypatch.setattr(estimate, "by_run", at_rest)
+    library = ep.polynomial(["x", "g"], degree=1)
+    with pytest.raises(FailedTryError, match="no states fit the data: a state must vary: 'g'"):
+        ep.estimate(only("x").window(0, 60), library, hidden=["g"])
+
+
 @pytest.mark.slow
 def test_ways_are_followed_that_process_noise_explains(monkeypatch: pytest.MonkeyPatch) -> None:
     followed = []
@@ -204,7 +226,7 @@ def test_guesses_are_close_without_noise() -> None:
     inner = slice(20, -20)
     # The division is held back a little where the factor is small.
     assert np.corrcoef(guess[inner], truth[inner])[0, 1] > 0.98
-    other = with_guess_by(PLANE.model, run)
+    (other,) = with_guesses_by(PLANE.model, run)
     assert np.corrcoef(other.columns(["y"])[inner, 0], truth[inner])[0, 1] < -0.98
 
 

@@ -192,13 +192,13 @@ def test_a_smoother_follows_pulses_and_few_samples_to_a_period():
     t, x = np.arange(600.0), run.states[100:, 0] ** 2
     column = x[:, None]
     assert ep.signals.KalmanSmoother().estimate(t, column).noise_std[0] > 0.9 * x.std()
-    memory_s = signal_memory_s(t, x, kept=0.99)
+    memory_s = signal_memory_s(t, x)
     held = ep.signals.KalmanSmoother(coarsest_s=memory_s).estimate(t, column)
     assert held.noise_std[0] < 0.3 * x.std()
     assert np.std(held.smoothed[:, 0] - x) < 0.15 * x.std()
     # White noise has nothing to be followed.
     noise = np.random.default_rng(0).standard_normal(600)
-    assert signal_memory_s(t, noise, kept=0.99) == t[-1]
+    assert signal_memory_s(t, noise) == t[-1]
 
 
 @pytest.mark.parametrize("fraction", [0.02, 0.05, 0.2])

@@ -6,11 +6,14 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
+from numba.core import config, cpu
 
 from ep2sindy.app import precompile
-from ep2sindy.runtime import compilation
+from ep2sindy.runtime import compilation, screen
 
 
 def full() -> None:
@@ -21,6 +24,7 @@ def full() -> None:
 def compilations(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[bool]:
     """What comes of each compilation, the next one first; the cache lies in `tmp_path`."""
     outcomes = [True, True, True]
+    monkeypatch.setattr(screen, "SAID", set())
     monkeypatch.setenv("EP2SINDY_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr(precompile, "_compile_all", lambda: None if outcomes.pop(0) else full())
     return outcomes
@@ -34,6 +38,21 @@ def test_kernels_are_compiled_once_and_reported_to_be(
     precompile.precompile()
     assert capsys.readouterr().err == ""
     assert len(compilations) == 2
+
+
+def test_numba_is_left_as_it_is_and_knows_that_arrays_are_separate() -> None:
+    @compilation.compiled(**compilation.LOOPS)
+    def double(values: Any, doubled: Any) -> None:
+        for k in range(len(values)):
+            doubled[k] = 2.0 * values[k]
+
+    double._cache.disable()
+    double(np.ones(2), np.empty(2))
+    (llvm,) = double.inspect_llvm().values()
+    heads = [line for line in llvm.splitlines() if line.startswith("define") and "double" in line]
+    assert "ptr noalias" in heads[0].split("%arg.", 1)[1]
+    assert not hasattr(cpu.CPUTargetOptions, "noalias")
+    assert os.environ.get("NUMBA_CACHE_DIR", "") == config.CACHE_DIR
 
 
 def test_kernels_are_compiled_again_where_a_source_has_changed(
@@ -63,12 +82,13 @@ import my_kernels
 """
 
 
-def called(folder: Path, **environment: str) -> subprocess.CompletedProcess[str]:
-    """Run a kernel that calls another, by a process of its own."""
-    return subprocess.run(
-        [sys.executable, "-c", CALL, str(folder)],
-        env=os.environ | environment, capture_output=True, text=True, check=True,
-    )  # fmt: skip
+def called(
+    folder: Path, *arguments: str, env: dict[str, str] | None = None, **environment: str
+) -> subprocess.CompletedProcess[str]:
+    """Run a kernel that calls another, or other arguments, by a process of its own."""
+    env = (os.environ if env is None else env) | environment
+    command = [sys.executable, *(arguments or ("-c", CALL, str(folder)))]
+    return subprocess.run(command, env=env, capture_output=True, text=True, check=True)
 
 
 @pytest.fixture
@@ -80,8 +100,46 @@ def kernels(tmp_path: Path) -> Path:
     program = (
         f"{start}from inner import inner\n@compiled\ndef twice(x):\n    return 2.0 * inner(x)\n"
     )
-    (folder / "my_kernels.py").write_text(f"{program}print(twice(1.5))\n")
+    own = "import numba\n@numba.njit\ndef own(x):\n    return x\n"
+    (folder / "my_kernels.py").write_text(f"{own}{program}print(own(twice(1.5)))\n")
     return folder
+
+
+def homeless(folder: Path) -> dict[str, str]:
+    """The environment of a user without a home, whom the system does not know either."""
+    (folder / "sitecustomize.py").write_text("import pwd\npwd.getpwuid = {}.__getitem__\n")
+    return {"PYTHONPATH": f"{folder}{os.pathsep}{compilation.PACKAGE.parent}"}
+
+
+NO_HOME = compilation.not_kept(
+    OSError("this user has no home folder; EP2SINDY_CACHE names a folder")
+)
+
+
+def test_a_user_without_a_home_can_call_kernels(kernels: Path) -> None:
+    run = called(kernels, env=homeless(kernels))
+    assert (run.stdout, run.stderr) == ("5.0\n", f"{compilation.ANNOUNCEMENT}\n{NO_HOME}\n")
+
+
+def test_a_kernel_that_does_not_fit_on_the_disk_is_compiled(kernels: Path, tmp_path: Path) -> None:
+    full = "import resource\nresource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))\n"
+    run = called(kernels, "-c", full + CALL, str(kernels), EP2SINDY_CACHE=str(tmp_path / "cache"))
+    assert run.stdout == "5.0\n"
+    assert run.stderr.count("\n") == 2
+    assert "ep2sindy: compiled kernels are not kept: " in run.stderr
+
+
+@pytest.mark.slow
+def test_a_program_without_a_home_says_once_that_nothing_is_kept(tmp_path: Path) -> None:
+    """Two workers compile too, and say nothing."""
+    study = (
+        "+exp=benchmark variants=[ours] systems=[lotka_volterra] n_realizations=1 parallel.n_jobs=2"
+    )
+    command = ["-m", "ep2sindy.app.main", *study.split(), f"output={tmp_path}"]
+    run = called(tmp_path, *command, env=homeless(tmp_path))
+    assert "Found: ours, selected exactly right" in run.stdout
+    said = [line for line in run.stderr.splitlines() if line.startswith("ep2sindy: ")]
+    assert said == [compilation.ANNOUNCEMENT, NO_HOME]
 
 
 def test_a_kernel_is_kept_where_one_may_write_and_follows_what_it_calls(

@@ -18,10 +18,10 @@ import numpy as np
 import ep2sindy as ep
 from ep2sindy.model.many import WindowSteps, run_many
 from ep2sindy.model.vector_field import VectorField
-from ep2sindy.runtime.compilation import ANNOUNCEMENT, announce_once, digest, sources
+from ep2sindy.runtime.compilation import ANNOUNCEMENT, UNKEPT, digest, not_kept, sources
 from ep2sindy.runtime.parallel import Loky
 from ep2sindy.runtime.progress import Bars
-from ep2sindy.runtime.screen import say
+from ep2sindy.runtime.screen import say, say_once
 from ep2sindy.runtime.user_cache import cache_folder
 
 ABOUT = """Compiles all kernels of the package, once after installation: a minute on two cores.
@@ -43,11 +43,13 @@ def precompile() -> None:
     """Compile all kernels with a message, unless this machine has compiled these sources."""
     try:
         stamp = _stamp()
-    except OSError:  # every process compiles what it uses, and says so
+    except OSError as error:  # every process compiles what it uses
+        say_once(ANNOUNCEMENT)
+        say_once(not_kept(error))
         return
     if stamp.exists():
         return
-    say(ANNOUNCEMENT, error=True)
+    say_once(ANNOUNCEMENT)
     with suppress(OSError):  # on a full disk, the next run repeats this half minute
         _compile_all()
         stamp.mkdir()
@@ -73,8 +75,9 @@ def _compile_all() -> None:
 
 
 def _compile(part: str) -> None:
-    announce_once()  # for all processes
     PARTS[part]()
+    for error in UNKEPT[:1]:
+        raise error
 
 
 def _search() -> None:

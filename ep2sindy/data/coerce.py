@@ -8,7 +8,8 @@ trajectories that agree, and a library with what is known of the equations.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -161,7 +162,20 @@ def _common_start(first: Float[np.ndarray, "n d"], second: Float[np.ndarray, "m 
     return n if same and np.array_equal(first[:n], second[:n]) else 0
 
 
-# What a method is asked.
+# What a method is asked, and what it makes of that.
+
+
+class FailedTryError(ValueError):
+    """What a search made of its own results cannot be used: this try failed, others need not."""
+
+
+@contextmanager
+def own_result(what: str) -> Iterator[None]:
+    """A value that a search makes of its own results; where its checks fail, the try failed."""
+    try:
+        yield
+    except ValueError as error:
+        raise FailedTryError(f"{what}: {error}") from error
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,7 @@ from functools import partial
 
 import numpy as np
 
-from ep2sindy.data.coerce import DiscoveryProblem
+from ep2sindy.data.coerce import DiscoveryProblem, FailedTryError
 from ep2sindy.data.numbers import least_beside_grid
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import discover
@@ -267,6 +267,7 @@ def try_in_turn(
     search in smoothed states; a rule that runs models tests them by the signal. stated: of the
     equations. linear: whether the signal is (`is_linear`); None finds out. once: does each search,
     or takes it from a run that was interrupted.
+    Raises FailedTryError if every try failed.
     """
     stated, linear = stated or StatedFacts(), is_linear(past) if linear is None else linear
     smoothed = [each for each in tried if each.how != "hidden"]
@@ -279,21 +280,28 @@ def try_in_turn(
         elif linear and smoothed:
             tried = [smoothed[0].linear(past)]
     method, part = assessed_by(method, past.name), end_of_periods(past)
-    attempts, left_out = [], []
+    attempts: list[Attempt] = []
+    left_out, failed = [], FailedTryError()
     for each in tried:
         search = partial(
             each.search, method=method, stated=stated, seed=seed, progress=progress, once=once
         )
-        if each.how == "hidden" and smoothed and part is not past and search(part)[1].lack_of_fit:
-            continue
-        states, found = search(past)
-        if not states.unsmoothed:
-            attempts.append(Attempt.of(each, states, found, progress))
-        elif explains(found, past.name):
-            states = replace(states, reason=EXPLAINED)
-            return [Attempt.of(each, states, found, progress)]
-        else:
-            left_out.append((each, states, found))
+        try:
+            brief = each.how == "hidden" and smoothed and part is not past
+            if brief and search(part)[1].lack_of_fit:
+                continue
+            states, found = search(past)
+            if not states.unsmoothed:
+                attempts.append(Attempt.of(each, states, found, progress))
+            elif explains(found, past.name):
+                states = replace(states, reason=EXPLAINED)
+                return [Attempt.of(each, states, found, progress)]
+            else:
+                left_out.append((each, states, found))
+        except FailedTryError as error:
+            failed = error
+    if not (attempts or left_out):
+        raise failed
     return attempts or [Attempt.of(*left_out[-1], progress)]
 
 
@@ -430,7 +438,10 @@ def fit_offset(
     )
     for fraction in SHIFTS:
         shift = fraction * spread - mean
-        found = once(partial(search, replace(run, states=run.states + shift)))
+        try:
+            found = once(partial(search, replace(run, states=run.states + shift)))
+        except FailedTryError:
+            continue
         rest = found.model.terms(x).get(g, 0.0)
         if not found.lack_of_fit and is_positive(past.t, past.x + shift + rest):
             low, high = found.model.intervals(x).get(g, (rest, rest))

@@ -12,7 +12,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ep2sindy.data.coerce import DiscoveryProblem, check_domain
+from ep2sindy.data.coerce import (
+    DiscoveryProblem,
+    FailedTryError,
+    check_domain,
+    check_repeats,
+    own_result,
+)
 from ep2sindy.data.runs import Runs, trajectories_of
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.estimation.cost import SearchMonitor, check_limit_s, check_size, growing_parts
@@ -221,12 +227,18 @@ def estimate(
     bytes_each = check_size(task.runs, task.library, facts.only, coupled=coupled, limit_s=limit_s)
     watch = as_progress(progress)
     monitor, found, part = SearchMonitor(watch, limit_s), None, task.runs
+    failed = FailedTryError()
     settings = _Settings(max_terms, align, courses, monitor)
     for larger in growing_parts(task.runs, bytes_each, monitor):
-        latest = _answer(replace(task, runs=larger), settings)
+        try:
+            latest = _answer(replace(task, runs=larger), settings)
+        except FailedTryError as error:
+            failed = error
+            continue
         if found is None or not monitor.ended:  # a larger part tells more, once it is done with
             found, part = latest, larger
-    assert found is not None
+    if found is None:
+        raise failed
     answer, fitted = found
     some, n = (sum(run.n_samples for run in each) for each in (part, task.runs))
     if some < n:
@@ -239,8 +251,12 @@ def estimate(
     if facts.roles is not None:
         played = compress(answer.solution.problem.processes, answer.solution.fit.free != 0.0)
         constraint = constraint_of(library, task.states, list(played), facts.roles.stated)
-    model = _model(answer, library, fitted[0].units, provenance or {})
+    model = _model(answer, library, fitted[0][0].units, provenance or {})
     return replace(_report(answer, model, fitted, watch), constraint=constraint)
+
+
+# What was found, and every run as it was fitted, with its path.
+Answer = tuple[Explanation, Sequence[tuple[Trajectory, BySample]]]
 
 
 class _Settings(NamedTuple):
@@ -252,33 +268,42 @@ class _Settings(NamedTuple):
     monitor: SearchMonitor
 
 
-def _answer(
-    task: DiscoveryProblem, settings: _Settings
-) -> tuple[Explanation, Sequence[Trajectory]]:
+def _answer(task: DiscoveryProblem, settings: _Settings) -> Answer:
     """Answer a task from all of its runs.
 
     The ways in which hidden states may enter are tried under process noise first. Those that
     explain the samples then are followed to an exact trajectory, and those that ran away, of which
     that says nothing; if none of these explains them, so is the likeliest of the others, with few
     terms.
+    Raises FailedTryError if no way leads to states that can be used.
     """
     if not task.hidden:
-        return _Way.of(task, task, (), settings).answer(settings), task.runs
-    tried: list[tuple[Explanation, Sequence[Trajectory]]] = []
+        return _Way.of(task, task, (), settings).answer(settings)
+    tried: list[Answer] = []
     doubtful: list[tuple[Explanation, _Way]] = []
+    failed: list[FailedTryError] = []
+
+    def follow(way: _Way, under_noise: Explanation, settings: _Settings) -> None:
+        try:
+            tried.append(way.answer(settings, under_noise))
+        except FailedTryError as error:
+            failed.append(error)
+
     for group in with_guesses(task):
         ways = [_Way.of(task, known, couplings, settings) for known, couplings in group]
         for under_noise, way in [(way.begin(settings), way) for way in ways]:
             if not under_noise.solution.fits and np.isfinite(under_noise.solution.deviance):
                 doubtful.append((under_noise, way))
             elif not settings.monitor.ended:
-                tried.append((way.answer(settings, under_noise), way.runs))
+                follow(way, under_noise, settings)
         if settings.monitor.ended or any(not answer.lack_of_fit for answer, _ in tried):
             break
     else:
         for under_noise, way in sorted(doubtful, key=lambda each: each[0].solution.deviance)[:1]:
             few = settings._replace(max_terms=settings.max_terms or FIRST_MAX_TERMS)
-            tried.append((way.answer(few, under_noise), way.runs))
+            follow(way, under_noise, few)
+    if not tried:
+        raise failed[0]
     return min(tried, key=lambda each: (bool(each[0].lack_of_fit), each[0].solution.rank))
 
 
@@ -327,13 +352,24 @@ class _Way:
         """Answer under process noise."""
         return self._stated(explain_under_noise(self.problem, max_terms=settings.max_terms))
 
-    def answer(self, settings: _Settings, under_noise: Explanation | None = None) -> Explanation:
-        """Answer by an exact trajectory, if one explains the samples."""
+    def answer(self, settings: _Settings, under_noise: Explanation | None = None) -> Answer:
+        """Answer by an exact trajectory, if one explains the samples; with the runs as fitted."""
         found = explain(
             self.problem, max_terms=settings.max_terms, align=settings.align,
             under_noise=under_noise,
         )  # fmt: skip
-        return self._stated(found)
+        problem = found.solution.problem
+        # A fit follows the flow but for a little, which must not take a nonnegative state below
+        # zero.
+        paths = [
+            np.where(problem.nonnegative, np.maximum(path, 0.0), path)
+            for path in found.solution.fit.paths
+        ]
+        with own_result("no states fit the data"):
+            fitted = list(by_run(problem, paths, self.runs))
+            if not problem.measured.all():
+                check_repeats([run for run, _ in fitted])
+        return self._stated(found), fitted
 
     def _stated(self, found: Explanation) -> Explanation:
         return replace(found, data_warnings=(*self.words, *found.data_warnings))
@@ -342,25 +378,23 @@ class _Way:
 def _report(
     answer: Explanation,
     model: SparseModel,
-    runs: Sequence[Trajectory],
+    fitted: Sequence[tuple[Trajectory, BySample]],
     progress: Progress,
 ) -> Estimate:
     """Convert the solution to SI, and add its rivals."""
     problem, found = answer.solution.problem, answer.solution
-    fit, pair = found.fit, gram(found.fit)
+    pair = gram(found.fit)
     supports = {
         state: _score_supports(problem, pair, found, block)
         for block, state in count_pieces(
             progress, list(enumerate(problem.states)), "equation", "rivals"
         )
     }
-    # A fit follows the flow but for a little, which must not take a nonnegative state below zero.
-    paths = [np.where(problem.nonnegative, np.maximum(path, 0.0), path) for path in fit.paths]
-    fitted, paths = zip(*by_run(problem, paths, runs), strict=True)
+    runs, paths = zip(*fitted, strict=True)
     return Estimate(
         model=model,
         paths=paths,
-        runs=fitted,
+        runs=runs,
         noise_std=np.where(problem.measured, found.noise.std * problem.scale, np.nan),
         memory=found.noise.memory,
         flow_error=found.flow_error,

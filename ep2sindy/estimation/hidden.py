@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.interpolate import make_interp_spline
 
-from ep2sindy.data.coerce import DiscoveryProblem
+from ep2sindy.data.coerce import DiscoveryProblem, FailedTryError, check_domain, own_result
 from ep2sindy.data.numbers import least_squares
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library
@@ -29,10 +29,14 @@ from ep2sindy.library.units import unit_product
 from ep2sindy.model.model import SparseModel
 from ep2sindy.signals.signal import is_positive
 from ep2sindy.signals.smoothers import KalmanSmoother
+from ep2sindy.signals.spectrum import signal_memory_s
 
 # Fraction of a factor's mean square that weighs a hidden state's mean against what its rate tells:
 # where the factor is small, this is little.
 LEAST_FACTOR = 0.03
+
+# Noise, in standard deviations of a signal, from which a smoother is suspected to take it for that.
+DROWNED = 0.5
 
 Columns = dict[str, Float[np.ndarray, " samples"]]
 
@@ -103,7 +107,8 @@ def with_guesses(
 ) -> Iterator[list[tuple[DiscoveryProblem, tuple[Coupling, ...]]]]:
     """Tasks without hidden states, one for every way in: guesses stand among the samples.
 
-    They come in groups, the most natural first; the next group counts if no way of it fits. A
+    They come in groups, the most natural first; the next group counts if no way of it fits. Ways
+    without a guess that the library can be evaluated at are left out. A
     single measured state that is positive has a growth rate, whose equation keeps it positive; one
     that takes either sign has a rate, for no growth rate would let it through zero.
     """
@@ -116,8 +121,19 @@ def with_guesses(
         groups = sorted(groups, key=lambda ways: ways[0][0].term == task.hidden[0])
     else:
         groups = [ways for ways in groups if ways[0][0].term == task.hidden[0]] or groups
+    failed, any_guess = FailedTryError(), False
     for group in groups:
-        yield [(_insert_guesses(task, ways), ways) for ways in group]
+        tasks = []
+        for ways in group:
+            try:
+                tasks.append((_insert_guesses(task, ways), ways))
+            except FailedTryError as error:
+                failed = error
+        if tasks:
+            any_guess = True
+            yield tasks
+    if not any_guess:
+        raise failed
 
 
 def _insert_guesses(task: DiscoveryProblem, ways: Sequence[Coupling]) -> DiscoveryProblem:
@@ -129,7 +145,10 @@ def _insert_guesses(task: DiscoveryProblem, ways: Sequence[Coupling]) -> Discove
     library = task.library.relate(*(way.relation for way in ways if not way.given))
     if len(task.runs[0].state_names) == 1 and first.state not in task.facts.only:
         library = library.only({first.state: (first.term,)})
-    return DiscoveryProblem([with_guess(run, library, ways) for run in task.runs], library)
+    with own_result("no guess of the hidden states"):
+        guessed = DiscoveryProblem([with_guess(run, library, ways) for run in task.runs], library)
+        check_domain(guessed.runs, library, smooth=True)
+    return guessed
 
 
 def with_guess(run: Trajectory, library: Library, ways: Sequence[Coupling]) -> Trajectory:
@@ -138,7 +157,7 @@ def with_guess(run: Trajectory, library: Library, ways: Sequence[Coupling]) -> T
     Each one explains what a regression on the states before it leaves of the rate that it enters.
     The rate of a single measured state is left to its hidden state as a whole.
     """
-    known, rates = _smooth(run)
+    known, rates = _smoothings(run)[0]
     whole = run.state_names[0] if len(run.state_names) == 1 else ""
     units = dict(run.units)
     for way in ways:
@@ -153,12 +172,25 @@ def with_guess(run: Trajectory, library: Library, ways: Sequence[Coupling]) -> T
     return _insert_states(run, known, units)
 
 
-def with_guess_by(model: SparseModel, run: Trajectory) -> Trajectory:
+def with_guesses_by(model: SparseModel, run: Trajectory) -> list[Trajectory]:
     """A run with the states that it lacks, as the equations of a model tell them from its rates.
 
-    Raises ValueError if no equation of the known states tells one of the others alone.
+    There are as many guesses as ways to smooth the run.
+    Raises ValueError if no equation of the known states tells one of the others alone, and
+    FailedTryError if no guess can be used.
     """
-    known, rates = _smooth(run)
+    found, failed = [], FailedTryError()
+    for known, rates in _smoothings(run):
+        try:
+            found.append(_guess_by(model, run, known, rates))
+        except FailedTryError as error:
+            failed = error
+    if not found:
+        raise failed
+    return found
+
+
+def _guess_by(model: SparseModel, run: Trajectory, known: Columns, rates: Columns) -> Trajectory:
     lacking = [name for name in model.states if name not in run.state_names]
     units = dict(run.units) | {name: model.units.get(name, "1") for name in lacking}
     while lacking:
@@ -193,12 +225,28 @@ def _infer_state(
     return None
 
 
-def _smooth(run: Trajectory) -> tuple[Columns, Columns]:
-    """Smoothed states and the inputs, by name, and the rates of the states."""
-    found = KalmanSmoother().estimate(run.t, run.states)
-    known = dict(zip(run.state_names, found.smoothed.T, strict=True))
+def _smoothings(run: Trajectory) -> list[tuple[Columns, Columns]]:
+    """Smoothed states and the inputs, by name, and the rates of the states.
+
+    The likeliest smoother may take pulses for noise: first comes one that must follow them then.
+    """
     inputs = dict(zip(run.input_names, run.inputs.T, strict=True))
-    return known | inputs, dict(zip(run.state_names, found.derivative.T, strict=True))
+    likeliest = KalmanSmoother().estimate(run.t, run.states)
+    found = [(likeliest.smoothed.T, likeliest.derivative.T)]
+    drowned = likeliest.noise_std > DROWNED * run.states.std(axis=0)
+    if drowned.any():
+        known, rates = (columns.copy() for columns in found[0])
+        for k in np.flatnonzero(drowned).tolist():
+            x = run.states[:, k]
+            follower = KalmanSmoother(coarsest_s=signal_memory_s(run.t, x))
+            own = follower.estimate(run.t, x[:, None])
+            known[k], rates[k] = own.smoothed[:, 0], own.derivative[:, 0]
+        found = [(known, rates), *found]
+    return [
+        (dict(zip(run.state_names, known, strict=True)) | inputs,
+         dict(zip(run.state_names, rates, strict=True)))
+        for known, rates in found
+    ]  # fmt: skip
 
 
 def _add_state(
@@ -220,12 +268,13 @@ def _quotient(
 def _insert_states(run: Trajectory, known: Columns, units: Mapping[str, str]) -> Trajectory:
     """The run with more states; those that were measured as they were."""
     more = [name for name in known if name not in run.names]
-    return replace(
-        run,
-        states=np.column_stack([run.states, *(known[name] for name in more)]),
-        state_names=(*run.state_names, *more),
-        units=units,
-    )
+    with own_result(f"no guess of {', '.join(more)}"):
+        return replace(
+            run,
+            states=np.column_stack([run.states, *(known[name] for name in more)]),
+            state_names=(*run.state_names, *more),
+            units=units,
+        )
 
 
 def _linear_in(library: Library, name: str, others: Sequence[str]) -> Bool[np.ndarray, " terms"]:

@@ -15,10 +15,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ep2sindy.data.coerce import own_result
 from ep2sindy.data.runs import Run, trajectory_of
 from ep2sindy.data.sensor import Bounds
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.estimation.hidden import with_guess_by
+from ep2sindy.estimation.hidden import with_guesses_by
 from ep2sindy.estimation.kernels import filter_states
 from ep2sindy.estimation.likelihood import (
     FREE_START,
@@ -131,8 +132,10 @@ class StateEstimator:
 
         history: has the measured states of the model; others that it has only start the fit.
         """
-        record = self.problem.record(_select_variables(self.model, history)).end(self.memory)
-        fit = self.fit_path(record, record.samples)
+        guesses = _guess_states(self.model, history)
+        records = [self.problem.record(own).end(self.memory) for own in guesses]
+        fits = [(self.fit_path(record, record.samples), record) for record in records]
+        fit, record = min(fits, key=lambda pair: pair[0].total)
         _, mean, covariance = filter_states(*linearise(fit))
         end, scale = fit.path[-1] + mean, self.problem.scale
         if not (np.isfinite(end).all() and np.isfinite(covariance).all()):
@@ -145,13 +148,16 @@ class StateEstimator:
 
         Between gaps it starts anew. Segments of under five samples are left out.
         """
-        own = _select_variables(self.model, run)
+        guesses = _guess_states(self.model, run)
+        tried = [self.problem.record(own).segments() for own in guesses]
+        fits = [[self.fit_path(piece, piece.samples) for piece in pieces] for pieces in tried]
+        best = int(np.argmin([sum(fit.total for fit in own) for own in fits]))
+        own, pieces = guesses[best], tried[best]
         whole = self.problem.record(own)
-        pieces = whole.segments()
-        paths = [self.fit_path(piece, piece.samples).path for piece in pieces]
         kept = np.isin(whole.times, np.concatenate([piece.times for piece in pieces]))
-        states = np.concatenate(paths) * self.problem.scale
-        return replace(own, t=own.t[kept], states=states, inputs=own.inputs[kept])
+        states = np.concatenate([fit.path for fit in fits[best]]) * self.problem.scale
+        with own_result("the model does not follow the record"):
+            return replace(own, t=own.t[kept], states=states, inputs=own.inputs[kept])
 
     def with_process_noise(self, factor: float) -> StateEstimator:
         """The same with process noise that is larger by a factor."""
@@ -203,7 +209,20 @@ def tune_estimator(
             f"a record must have {MIN_SAMPLES} samples or more to tell its noise: got "
             f"{run.n_samples}; pass the record that the model was fitted to, fitted_to=..."
         )
-    own = _select_variables(model, run.window(max(0, run.n_samples - MAX_FITTED), run.n_samples))
+    end = run.window(max(0, run.n_samples - MAX_FITTED), run.n_samples)
+    guesses, watch = _guess_states(model, end), as_progress(progress)
+    begun, tried = _begin(model, guesses[0], names), []
+    for own in guesses:
+        estimator, deviance = begun, np.inf
+        paths = [record.samples for record in begun.problem.of([own]).records]
+        for _ in count_pieces(watch, range(N_PASSES), "pass", "errors of the model, for forecasts"):
+            estimator, paths, deviance = _with_likely_noise(estimator, paths)
+        tried.append((np.nan_to_num(deviance, nan=np.inf), estimator))
+    return min(tried, key=lambda pair: pair[0])[1]
+
+
+def _begin(model: SparseModel, own: Trajectory, names: Sequence[str]) -> StateEstimator:
+    """An estimator with a first guess of the noise; states that are guessed set their scale."""
     known = {state: [*terms] for state in model.states if (terms := model.terms(state))}
     problem = scale_problem([own], model.library.only(known), measured=names, courses=model.courses)
     paths, free = [record.samples for record in problem.records], _free_of(model, problem)
@@ -211,7 +230,7 @@ def tune_estimator(
     differences = np.concatenate([np.diff(path, n=3, axis=0) for path in paths])
     rough = np.sqrt(np.square(differences).mean(axis=0) / 20.0)
     rough = np.clip(rough, LEAST_NOISE, MOST)
-    estimator = StateEstimator(
+    return StateEstimator(
         model=model,
         problem=problem,
         free=free,
@@ -220,10 +239,6 @@ def tune_estimator(
         noise=_noise_of(problem, rough, 0.1 * rough),
         widths=BandWidths(np.ones(1), np.ones((1, len(model.states)))),
     )
-    watch = as_progress(progress)
-    for _ in count_pieces(watch, range(N_PASSES), "pass", "errors of the model, for forecasts"):
-        estimator, paths = _with_likely_noise(estimator, paths)
-    return estimator
 
 
 @one_thread()
@@ -275,15 +290,18 @@ def estimate_states(
 
 def _with_likely_noise(
     estimator: StateEstimator, paths: Sequence[np.ndarray]
-) -> tuple[StateEstimator, list[np.ndarray]]:
-    """The estimator with the most likely noise about the states, and these states, by segment."""
+) -> tuple[StateEstimator, list[np.ndarray], float]:
+    """The estimator with the most likely noise about the states, and these states, by segment.
+
+    And -2 log likelihood of the samples.
+    """
     records = estimator.problem.records
     paths = [estimator.fit_path(*pair).path for pair in zip(records, paths, strict=True)]
     samples, process = estimator.scaled_noise()
     fit = _fix(estimator.problem, records, paths, estimator.free, samples)
     fit = replace(fit, n_substeps=estimator.n_substeps, process_noise=process)
-    likely = _noise_of(estimator.problem, *likely_errors(fit)[:2])
-    return replace(estimator, noise=likely), paths
+    *errors, deviance = likely_errors(fit)
+    return replace(estimator, noise=_noise_of(estimator.problem, *errors)), paths, deviance
 
 
 def _fix(
@@ -319,19 +337,21 @@ def measured_states(model: SparseModel, run: Trajectory) -> list[str]:
     return found
 
 
-def _select_variables(model: SparseModel, run: Trajectory) -> Trajectory:
-    """The variables of a run that a model has, in its order; states that it lacks are guessed."""
-    if len(measured_states(model, run)) < len(model.states):
-        run = with_guess_by(model, run)
-    return Trajectory(
-        t=run.t,
-        states=run.columns(model.states),
-        state_names=tuple(model.states),
-        inputs=run.columns(model.inputs),
-        input_names=model.inputs,
-        units=run.units,
-        clock=run.clock,
-    )
+def _guess_states(model: SparseModel, run: Trajectory) -> list[Trajectory]:
+    """The variables of a run that a model has, in its order, by each guess of states it lacks."""
+    lacks = len(measured_states(model, run)) < len(model.states)
+    return [
+        Trajectory(
+            t=each.t,
+            states=each.columns(model.states),
+            state_names=tuple(model.states),
+            inputs=each.columns(model.inputs),
+            input_names=model.inputs,
+            units=each.units,
+            clock=each.clock,
+        )
+        for each in (with_guesses_by(model, run) if lacks else [run])
+    ]
 
 
 def _free_of(model: SparseModel, problem: EstimationProblem) -> Float[np.ndarray, " free"]:

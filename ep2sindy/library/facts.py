@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
+from typing import Any
 
 from ep2sindy.library.relations import Place, Relation
 from ep2sindy.library.roles import Roles
@@ -23,8 +24,8 @@ class Facts:
     coefficients, all terms of that equation. excluded: for each state that is named, terms that its
     equation may not have. known: coefficients that are functions of the operating point, in SI.
     roles: of terms, for equations that conserve what states exchange.
-    Raises ValueError for what are no lists of names, an equation without terms, or roles next to
-    anything else.
+    Raises ValueError for what are no lists of names or no sums of functions, an equation without
+    terms, or roles next to anything else.
     """
 
     relations: Sequence[Relation] = ()
@@ -38,12 +39,7 @@ class Facts:
             object.__setattr__(self, name, _by_state(getattr(self, name)))
         if empty := [state for state, terms in self.only.items() if not terms]:
             raise ValueError(f"an equation whose terms are given must have some: {empty} has none")
-        for place, factors in self.known_factors.items():
-            if not isinstance(factors, Mapping):
-                raise ValueError(
-                    "a known coefficient is a sum of functions of the parameters, such as "
-                    f"{{'x': {{'x*y': {{'1': 2.0}}}}}}, got {factors!r} for {place}"
-                )
+        object.__setattr__(self, "known", _copy(self.known))
         if self.roles is None:
             return
         check_kind("roles", self.roles, Roles, "ep.Roles(exchange=[('n_n', 'n_i')])")
@@ -55,22 +51,33 @@ class Facts:
             )
 
     def __or__(self, more: Facts) -> Facts:
-        """These facts and more of them; of an equation stated twice, the last terms hold."""
+        """These facts and more of them; one that is given twice counts once.
+
+        Raises ValueError for terms of one equation, a known coefficient or roles that are given
+        twice and differ.
+        """
         barred = {**self.excluded, **more.excluded}
+        only = {
+            s: _same(f"the terms of {s!r}", self.only.get(s), more.only.get(s), kind=frozenset)
+            for s in {**self.only, **more.only}
+        }
+        own, others = self.known_factors, more.known_factors
+        known: dict[str, dict[str, Mapping[str, float]]] = {}
+        for state, term in {**own, **others}:
+            values = own.get((state, term)), others.get((state, term))
+            known.setdefault(state, {})[term] = _same(f"the coefficient {state}: {term}", *values)
         return Facts(
-            (*self.relations, *more.relations),
-            {**self.only, **more.only},
+            tuple(dict.fromkeys((*self.relations, *more.relations))),
+            only,
             {s: (*self.excluded.get(s, ()), *more.excluded.get(s, ())) for s in barred},
-            {**self.known, **more.known},
-            more.roles or self.roles,
+            known,
+            _same("roles", self.roles, more.roles),
         )
 
     @property
     def known_factors(self) -> dict[Place, Mapping[str, float]]:
         """(state, term) -> function of the parameters -> its factor, of known coefficients."""
-        return {
-            (s, str(term)): own for s, terms in self.known.items() for term, own in terms.items()
-        }
+        return {(s, term): own for s, terms in self.known.items() for term, own in terms.items()}
 
     @property
     def places(self) -> list[Place]:
@@ -120,4 +127,27 @@ def _by_state(given: object) -> Mapping[str, tuple[str, ...]]:
                 f"terms must be lists of names, like {example}, got {names!r} for {state!r}; the "
                 "constant is '1', and a coefficient that is known is a relation, 'x: x == 0.5'"
             )
-    return MappingProxyType({state: tuple(names) for state, names in given.items()})
+    return MappingProxyType({state: tuple(dict.fromkeys(n)) for state, n in given.items()})
+
+
+def _copy(given: Any) -> Known:
+    """Known coefficients. Raises ValueError for what are no sums of functions by state and term."""
+    states = given.values() if isinstance(given, Mapping) else [given]
+    if not all(
+        isinstance(terms, Mapping) and all(isinstance(f, Mapping) for f in terms.values())
+        for terms in states
+    ):
+        raise ValueError(
+            "a known coefficient is a sum of functions of the parameters, such as "
+            f"{{'x': {{'x*y': {{'1': 2.0}}}}}}, got {given!r}"
+        )
+    return {s: {str(term): dict(f) for term, f in terms.items()} for s, terms in given.items()}
+
+
+def _same(what: str, first: Any, second: Any, kind: Callable[[Any], Any] = lambda one: one) -> Any:
+    """What is given by one of two, or alike by both; kind: frozenset if the order is none."""
+    if first is None or second is None:
+        return second if first is None else first
+    if kind(first) != kind(second):
+        raise ValueError(f"{what} must be given once, got {first} and {second}; drop one of them")
+    return first

@@ -36,8 +36,9 @@ class Library:
     """Ordered candidate terms, each a product of powers of variables and of functions of them.
 
     A library also holds facts, that is, what is known of the equations. `relate`, `only`,
-    `exclude`, `known` and `with_roles` each return a new library with one more fact. Models keep
-    only the terms, and so does `take`. `polynomial` and `named_terms` make libraries.
+    `exclude`, `known` and `with_roles` each return a new library with one more fact. A fact that is
+    given twice counts once, and facts that contradict each other are refused. Models keep only the
+    terms, and so does `take`. `polynomial` and `named_terms` make libraries.
 
     Parameters
     ----------
@@ -102,7 +103,7 @@ class Library:
     def __add__(self, other: Library) -> Library:
         """Join two libraries over the same variables; each term appears once, in order.
 
-        What is known by both holds.
+        What is known by either holds.
         """
         if other.variables != self.variables:
             raise ValueError(
@@ -135,7 +136,12 @@ class Library:
         return self._knowing(Facts(known=coefficients))
 
     def with_roles(self, roles: Roles | None) -> Library:
-        """With roles of terms, for equations that conserve what states exchange; see `Roles`."""
+        """With roles of terms, for equations that conserve what states exchange; see `Roles`.
+
+        None: without the roles that were given.
+        """
+        if roles is None:
+            return replace(self, facts=replace(self.facts, roles=None))
         return self._knowing(Facts(roles=roles))
 
     def _knowing(self, more: Facts) -> Library:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -42,7 +42,7 @@ class Relation:
 
     factors: tuple[tuple[float, str, str], ...]
     value: float
-    text: str
+    text: str = field(compare=False)
 
     def __post_init__(self) -> None:
         if not self.factors:
@@ -152,7 +152,7 @@ def constraint(
     support: Mapping[str, Sequence[str]],
     relations: Sequence[Relation | str] = (),
 ) -> Constraint:
-    """Eliminate one coefficient of the support per relation.
+    """Eliminate one coefficient of the support per relation that does not follow from others.
 
     The coefficient with the largest factor is eliminated; among equal factors, the one whose first
     mention in the relations comes last.
@@ -175,7 +175,7 @@ def constraint(
     Raises
     ------
     ValueError
-        If a relation contradicts or repeats earlier ones, names an unknown state or term, or names
+        If a relation contradicts earlier ones, names an unknown state or term, or names
         a term outside the support. The error quotes the relation.
 
     Examples
@@ -205,10 +205,11 @@ def constraint(
             size[k] += abs(factor)
         factors = _round(row @ C, size @ np.abs(C))
         value = _round(relation.value - row @ d, abs(relation.value) + size @ np.abs(d))
-        if not factors.any():
-            why = "contradicts" if value else "is redundant: it is implied by"
+        if not factors.any():  # it holds already, or cannot
+            if not value:
+                continue
             others = f"the earlier ones, {earlier}" if earlier else "arithmetic alone"
-            raise ValueError(f"relation {relation.text!r} {why} {others}; drop one of them")
+            raise ValueError(f"relation {relation.text!r} contradicts {others}; drop one of them")
         largest = (1.0 - ROUNDING) * np.abs(factors).max()
         last = [k for k in named if abs(factors[k]) >= largest][-1]
         change = np.outer(C[:, last], -factors / factors[last])

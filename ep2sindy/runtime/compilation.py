@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import numba
-from numba.core import config, cpu, event, options
+from numba.core.caching import CompileResultCacheImpl, FunctionCache, _CacheLocator
+from numba.core.compiler import Compiler
 
-from ep2sindy.runtime.screen import say
+from ep2sindy.runtime.screen import say_once
 from ep2sindy.runtime.user_cache import cache_folder
 from ep2sindy.trust.user_code import PACKAGE
 
@@ -22,18 +23,22 @@ IMPORT = re.compile(r"^from (ep2sindy(?:\.\w+)+) import", re.MULTILINE)
 ANNOUNCEMENT = "ep2sindy: compiling its kernels, once after installation (half a minute) ..."
 
 
-def _separate_arrays() -> dict[str, Any]:
-    """The option that tells the compiler that a kernel's array arguments are separate ones.
+def not_kept(error: OSError) -> str:
+    return f"ep2sindy: compiled kernels are not kept: {error}"
 
-    Numba's compiler has this flag, but its decorators do not offer it; {} where it has gone.
+
+class SeparateArrays(Compiler):
+    """Numba's compiler with its flag that a kernel's array arguments are separate ones.
+
+    Numba's decorators do not offer the flag.
     """
-    if not hasattr(options.TargetOptions, "Mapping"):
-        return {}
-    cpu.CPUTargetOptions.noalias = options.TargetOptions.Mapping("noalias")
-    return {"noalias": True}
+
+    def define_pipelines(self) -> Any:
+        self.state.flags.noalias = True
+        return super().define_pipelines()
 
 
-SEPARATE_ARRAYS = _separate_arrays()
+SEPARATE_ARRAYS: dict[str, Any] = {"pipeline_class": SeparateArrays}
 
 # How kernels are compiled that are nothing but loops over separate arrays that they are given.
 LOOPS: dict[str, Any] = {
@@ -62,16 +67,63 @@ def compiled(function: Callable | None = None, **options: Any) -> Any:
     """
     if function is None:
         return lambda each: compiled(each, **options)
-    _listen()
-    folder = _folder_of(Path(function.__code__.co_filename).parent)
-    place: Any = config
-    before, place.CACHE_DIR = place.CACHE_DIR, folder  # read where a function is decorated
-    try:
-        # No one calls kernels from C, and a wrapper for that would be compiled for each.
-        settings = {"no_cfunc_wrapper": True} | options
-        return numba.njit(cache=bool(folder), nogil=True, **settings)(function)
-    finally:
-        place.CACHE_DIR = before
+    # No one calls kernels from C, and a wrapper for that would be compiled for each.
+    kernel: Any = numba.njit(nogil=True, **{"no_cfunc_wrapper": True} | options)(function)
+    kernel._cache = _KernelCache(function)
+    return kernel
+
+
+class _Place(_CacheLocator):
+    """Where a kernel is kept: a folder whose name holds what numba would ask for as a stamp."""
+
+    def __init__(self, function: Callable, file: str) -> None:
+        self.line = function.__code__.co_firstlineno
+        self.folder = _folder_of(Path(file).parent)
+
+    def get_cache_path(self) -> str:
+        return self.folder
+
+    def get_source_stamp(self) -> str:
+        return ""
+
+    def get_disambiguator(self) -> str:
+        return str(self.line)
+
+    @classmethod
+    def from_function(cls, function: Callable, file: str) -> _Place:
+        return cls(function, file)
+
+
+class _KeptKernel(CompileResultCacheImpl):
+    _locator_classes: Any = (_Place,)
+
+
+class _KernelCache(FunctionCache):
+    """Numba's cache of one function, in our folder.
+
+    A compilation is announced, and a kernel that cannot be kept is compiled all the same.
+    """
+
+    _impl_class = _KeptKernel
+
+    def __init__(self, function: Callable) -> None:
+        super().__init__(function)
+        if not self.cache_path:
+            self.disable()
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        kernel = super().load_overload(sig, target_context)
+        if kernel is None:
+            say_once(ANNOUNCEMENT)
+        return kernel
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        try:
+            super().save_overload(sig, data)
+        except OSError as error:
+            UNKEPT.append(error)
+        for first in UNKEPT[:1]:
+            say_once(not_kept(first))
 
 
 @cache
@@ -81,7 +133,7 @@ def _folder_of(sources: Path) -> str:
     try:
         return str(cache_folder("kernels", f"{sources.name}_{digest(files)}"))
     except OSError as error:
-        _UNKEPT.append(f"; they are not kept, for {error}")
+        UNKEPT.append(error)
         return ""
 
 
@@ -114,29 +166,4 @@ def _imported(files: Iterable[Path]) -> set[Path]:
     return {place for place in places if place.is_file()}
 
 
-class _Listener(event.Listener):
-    """Announces once per process that kernels are being compiled; cached ones cause no message."""
-
-    def on_start(self, event: event.Event) -> None:
-        if announce_once():  # numba reports every function
-            say(ANNOUNCEMENT + "".join(_UNKEPT[:1]), error=True)
-
-    def on_end(self, event: event.Event) -> None:
-        pass
-
-
-def announce_once() -> bool:
-    """True at the first call of a process: the announcement is due then, or has been made."""
-    _ANNOUNCED.append(True)
-    return len(_ANNOUNCED) == 1
-
-
-_ANNOUNCED: list[bool] = []
-_UNKEPT: list[str] = []  # why kernels cannot be kept
-_LISTENERS: list[_Listener] = []
-
-
-def _listen() -> None:
-    if not _LISTENERS:
-        _LISTENERS.append(_Listener())
-        event.register("numba:compile", _LISTENERS[0])
+UNKEPT: list[OSError] = []  # why kernels cannot be kept

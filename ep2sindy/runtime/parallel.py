@@ -22,6 +22,7 @@ from joblib import Parallel, delayed, effective_n_jobs
 from joblib.parallel import BACKENDS, get_active_backend
 
 from ep2sindy.runtime.progress import SILENT, Progress
+from ep2sindy.runtime.screen import SAID
 from ep2sindy.runtime.threads import one_thread
 from ep2sindy.trust.interruption import end_with
 from ep2sindy.trust.user_code import own_packages
@@ -141,7 +142,13 @@ def with_its_code(function: Function) -> bytes:
     """Pickle a function with the code of the modules in the folder of the run that configs name."""
     for package in own_packages():
         cloudpickle.register_pickle_by_value(package)
-    return cloudpickle.dumps(function)
+    return cloudpickle.dumps(partial(_unrepeated, frozenset(SAID), function))
+
+
+def _unrepeated(said: frozenset[str], function: Function, piece: Any) -> Any:
+    """Do a piece without saying what the program has said."""
+    SAID.update(said)
+    return function(piece)
 
 
 def is_local() -> bool:

@@ -48,6 +48,16 @@ def say(text: str, *, error: bool = False) -> None:
         print(plain(text), file=stream, flush=True)
 
 
+def say_once(text: str) -> None:
+    """Print a line to standard error, unless this program or this worker's program has done so."""
+    if text not in SAID:
+        SAID.add(text)
+        say(text, error=True)
+
+
+SAID: set[str] = set()
+
+
 @contextmanager
 def on_screen(stream: Any) -> Iterator[None]:
     """Print to a stream within this context, ignoring a closed pipe (`| head`) or a full disk.

@@ -25,7 +25,10 @@ def cache_folder(kind: str, key: str) -> Path:
     It need not exist yet. If it does, it counts as used; if not, what is stale goes.
     Raises OSError if the user has no folder for caches that can be written.
     """
-    place = Path(os.environ.get(PLACE) or user_cache_path("ep2sindy")) / kind
+    try:
+        place = Path(os.environ.get(PLACE) or user_cache_path("ep2sindy")) / kind
+    except RuntimeError as error:
+        raise OSError(f"this user has no home folder; {PLACE} names a folder") from error
     if not place.is_absolute():
         raise OSError(f"a cache needs an absolute folder, got {place}; {PLACE} names another")
     try:

@@ -26,9 +26,6 @@ from ep2sindy.signals.spectrum import signal_memory_s
 # cannot describe more. Ion-transit oscillations, ten times faster, would spoil the derivative.
 HARMONICS = 7.0
 
-# Least fraction of what stands out of the noise floor in the spectrum that a smoother must follow.
-KEPT = 0.99
-
 MAX_STATES = 5
 
 # Neighbours whose mean predicts the next state, samples at either end and most samples used.
@@ -130,7 +127,7 @@ class Embedding:
         if self.how == "hidden":
             return t, [signal.x], float("nan")
         finest_s = signal.period_s / (2.0 * np.pi * self.harmonics)  # a radian of the highest one
-        coarsest_s = max(signal_memory_s(t, signal.x, kept=KEPT), finest_s)
+        coarsest_s = max(signal_memory_s(t, signal.x), finest_s)
         if self.how == "rate":
             _check_positive(signal)
             growth = LogSmoother(finest_s, coarsest_s).estimate(t, signal.x)

@@ -147,13 +147,15 @@ def lost_in_means(
     return float((taken * excess).sum()) / whole if whole else 0.0
 
 
-def signal_memory_s(
-    t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samples"], *, kept: float
-) -> float:
+# Least fraction of what stands out of the noise floor that a smoother must follow.
+KEPT = 0.99
+
+
+def signal_memory_s(t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samples"]) -> float:
     """Longest memory, in s, of a twice integrated Wiener process that still follows the signal.
 
     A smoother of memory tau passes the fraction 1 / (1 + (2 pi f tau)^6) of a component of
-    frequency f. What it changes may hold no more than 1 - kept of the power that stands out of the
+    frequency f. What it changes may hold no more than 1 - KEPT of the power that stands out of the
     noise floor.
     """
     frequency, power = power_spectrum(t, x)
@@ -163,7 +165,7 @@ def signal_memory_s(
 
     def too_long(log_tau: float) -> float:
         passed = 1.0 / (1.0 + (2.0 * np.pi * frequency[1:] * np.exp(log_tau)) ** 6)
-        return float((excess * np.square(1.0 - passed)).sum() / excess.sum() - (1.0 - kept))
+        return float((excess * np.square(1.0 - passed)).sum() / excess.sum() - (1.0 - KEPT))
 
     from scipy.optimize import brentq  # imported only where a smoother is bounded
 
