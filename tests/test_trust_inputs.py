@@ -16,6 +16,7 @@ from ep2sindy.app.compare import read_run
 from ep2sindy.data.mapping import read_array
 from ep2sindy.data.readers.registry import open_source
 from ep2sindy.library.names import split_term
+from ep2sindy.runtime.files import check_regular, read_bytes
 from ep2sindy.thruster.axial.settings import Settings
 from ep2sindy.trust import memory
 
@@ -102,8 +103,53 @@ def test_a_damaged_run_folder_is_named(name: str, content: str, tmp_path: Path) 
 def test_a_pipe_is_refused_and_not_waited_for(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "a.csv")
     for path in (tmp_path / "a.csv", Path("/dev/zero")):
-        with pytest.raises(ValueError, match="a file or a folder must come"):
-            open_source(path)
+        for read in (open_source, read_bytes, check_regular):
+            with pytest.raises(ValueError, match="a file or a folder must come: .* is a pipe"):
+                read(path)
+    with pytest.raises(ValueError, match=r"a\.csv is a pipe"):
+        check_regular(tmp_path)
+
+
+@pytest.mark.skipif(not Path("/dev/null").exists(), reason="devices of POSIX")
+@pytest.mark.parametrize("place", [".zgroup", "I/.zarray", "I/.zattrs", "I/0", "more"])
+def test_a_zarr_store_holds_files_alone(place: str, tmp_path: Path) -> None:
+    """A device, of which nothing is read, in the place of a pipe, which would be waited for."""
+    path = tmp_path / "a.zarr"
+    xr.Dataset({"I": ("time", np.arange(5.0))}).to_zarr(path, consolidated=False, zarr_format=2)
+    assert open_source(path).names == ["I"]
+    (path / place).unlink(missing_ok=True)
+    (path / place).symlink_to("/" if place == "more" else "/dev/null")
+    with pytest.raises(ValueError, match=rf"a\.zarr cannot be read: .*{place} is a pipe, .* link"):
+        open_source(path)
+
+
+@pytest.mark.parametrize("leads", ["raw", "virtual", "linked"])
+def test_values_of_hdf5_lie_in_the_file_itself(leads: str, tmp_path: Path) -> None:
+    layout = h5py.VirtualLayout((5,), "f8")
+    layout[:] = h5py.VirtualSource(os.devnull, "x", (5,))
+    with h5py.File(tmp_path / "a.nc", "w") as file:
+        if leads == "raw":
+            file.create_dataset("x", (5,), "f8", external=[(os.devnull, 0, 40)])
+        elif leads == "virtual":
+            file.create_virtual_dataset("x", layout)
+        else:
+            file["x"] = h5py.ExternalLink(os.devnull, "/x")
+    for read in (open_source, ep.data.read_field, ep.thruster.Restart):
+        with pytest.raises(ValueError, match=r"a\.nc cannot be read: 'x' must lie in the file"):
+            read(tmp_path / "a.nc")
+
+
+def test_what_is_packed_is_counted_unpacked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    np.savez_compressed(tmp_path / "a.npz", x=np.zeros(10_000))
+    xr.Dataset({"x": ("time", np.zeros(10_000, "i1"))}).to_netcdf(tmp_path / "a.nc")
+    monkeypatch.setattr(memory, "UNCOUNTED", 0)
+    monkeypatch.setattr(memory, "free_bytes", lambda: 70_000)
+    with pytest.raises(ValueError, match=r"a\.npz cannot be read: 'x.npy' would take 8.01e-05 GB"):
+        open_source(tmp_path / "a.npz")
+    with pytest.raises(ValueError, match=r"a\.nc cannot be read: 'x' would take 8e-05 GB"):
+        read_array(open_source(tmp_path / "a.nc"), "x", "x")
 
 
 def test_an_array_is_counted_before_memory_is_asked_for(tmp_path: Path) -> None:
