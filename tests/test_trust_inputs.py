@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,9 +17,13 @@ from ep2sindy.app.compare import read_run
 from ep2sindy.data.mapping import read_array
 from ep2sindy.data.readers.registry import open_source
 from ep2sindy.library.names import split_term
+from ep2sindy.library.units import SECONDS
+from ep2sindy.report.picture import read_png
+from ep2sindy.report.results import value_text
 from ep2sindy.runtime.files import check_regular, read_bytes
 from ep2sindy.thruster.axial.settings import Settings
 from ep2sindy.trust import memory
+from tests.programs import ended
 
 LAW = {
     "format": "ep2sindy.OperatingLaw/1", "parameters": ["V"], "functions": ["1"],
@@ -80,23 +85,52 @@ def test_a_law_that_cannot_be_is_refused(change: dict, tmp_path: Path) -> None:
 
 RUN = {"summary.json": '{"experiment": "weak", "seed": 1}', "provenance.json": "{}",
        "config.yaml": "seed: 1"}  # fmt: skip
+NINE_TIMES = "a0: &a0 [x]\n" + "".join(
+    f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 9)}]\n" for k in range(1, 12)
+)  # 400 bytes that stand for 9^11 values
+CONFIGS = {
+    NINE_TIMES: "must hold 100000 values or fewer",
+    f"a: {'[' * 3000}{']' * 3000}": "50 deep",
+    "a: &a [*a]": "with its anchors expanded",
+}
 
 
 @pytest.mark.parametrize(
-    ("name", "content"),
+    ("name", "content", "message"),
     [
-        ("summary.json", '{"experiment": "weak", "seed": 1, "data": {"time_unit": "ages"}}'),
-        ("provenance.json", "[1]"),
-        ("config.yaml", "a: &a {b: *a}"),
+        ("summary.json", '{"experiment": "weak", "seed": 1, "data": {"time_unit": "ages"}}', ""),
+        ("summary.json", "[" * 100_000, "it is damaged"),
+        ("provenance.json", "[1]", ""),
+        ("provenance.json", '{"versions": "text"}', "it is damaged"),
+        *(("config.yaml", content, message) for content, message in CONFIGS.items()),
     ],
 )
-def test_a_damaged_run_folder_is_named(name: str, content: str, tmp_path: Path) -> None:
+def test_a_damaged_run_folder_is_named(
+    name: str, content: str, message: str, tmp_path: Path
+) -> None:
     for each, text in RUN.items():
         (tmp_path / each).write_text(text)
     assert read_run(tmp_path, 0).settings == {"seed": 1}
     (tmp_path / name).write_text(content)
-    with pytest.raises(ValueError, match=f"{name} cannot be read: "):
+    with pytest.raises(ValueError, match=f"{name} cannot be read: .*{message}"):
         read_run(tmp_path, 0)
+
+
+@pytest.mark.parametrize("content", CONFIGS)
+def test_a_config_is_counted_before_it_is_expanded(
+    content: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "conf" / "exp").mkdir(parents=True)
+    (tmp_path / "conf" / "exp" / "theirs.yaml").write_text(f"# @package _global_\n{content}\n")
+    assert re.search(rf"^error: .*theirs\.yaml .*{CONFIGS[content]}", ended("+exp=theirs"))
+
+
+def test_pictures_are_pngs_and_numbers_of_any_size_are_shown(tmp_path: Path) -> None:
+    (tmp_path / "a.png").write_bytes(b"x" * 99)
+    with pytest.raises(ValueError, match=r"a\.png must be a PNG, got b'xxxx"):
+        read_png(tmp_path / "a.png", "")
+    assert value_text("one/f_kHz", 1e308, SECONDS) == "-"
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes of POSIX")
