@@ -3,6 +3,8 @@
 import json
 import os
 import re
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -184,6 +186,24 @@ def test_what_is_packed_is_counted_unpacked(
         open_source(tmp_path / "a.npz")
     with pytest.raises(ValueError, match=r"a\.nc cannot be read: 'x' would take 8e-05 GB"):
         read_array(open_source(tmp_path / "a.nc"), "x", "x")
+
+
+WAITS = """
+import threading
+from ep2sindy.app import main
+
+def command(arguments, conf):
+    threading.Thread(target=threading.Event().wait).start()  # as for a file that never comes
+    raise KeyboardInterrupt
+
+main.command = command
+main.main()
+"""
+
+
+def test_an_interrupted_run_ends_though_a_thread_waits() -> None:
+    done = subprocess.run([sys.executable, "-c", WAITS], capture_output=True, text=True, timeout=99)
+    assert (done.returncode, done.stderr.split(":")[0]) == (1, "interrupted")
 
 
 def test_an_array_is_counted_before_memory_is_asked_for(tmp_path: Path) -> None:

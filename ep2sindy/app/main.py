@@ -57,7 +57,8 @@ def main() -> None:
             "can use again with data.cache=PATH"
         ]
     except KeyboardInterrupt:
-        sys.exit("interrupted: files under their final names are whole")
+        say("interrupted: files under their final names are whole", error=True)
+        os._exit(1)  # at once: a thread that waits, as for a file, would keep the process
     if errors:
         why = errors[0] if len(errors) == 1 else f"{len(errors)} jobs failed"
         sys.exit(plain(f"error: {why}"))
