@@ -2,6 +2,9 @@
 
 import json
 import os
+import re
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,8 +19,13 @@ from ep2sindy.app.compare import read_run
 from ep2sindy.data.mapping import read_array
 from ep2sindy.data.readers.registry import open_source
 from ep2sindy.library.names import split_term
+from ep2sindy.library.units import SECONDS
+from ep2sindy.report.picture import read_png
+from ep2sindy.report.results import value_text
+from ep2sindy.runtime.files import check_regular, read_bytes
 from ep2sindy.thruster.axial.settings import Settings
 from ep2sindy.trust import memory
+from tests.programs import ended
 
 LAW = {
     "format": "ep2sindy.OperatingLaw/1", "parameters": ["V"], "functions": ["1"],
@@ -79,31 +87,123 @@ def test_a_law_that_cannot_be_is_refused(change: dict, tmp_path: Path) -> None:
 
 RUN = {"summary.json": '{"experiment": "weak", "seed": 1}', "provenance.json": "{}",
        "config.yaml": "seed: 1"}  # fmt: skip
+NINE_TIMES = "a0: &a0 [x]\n" + "".join(
+    f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 9)}]\n" for k in range(1, 12)
+)  # 400 bytes that stand for 9^11 values
+CONFIGS = {
+    NINE_TIMES: "must hold 100000 values or fewer",
+    f"a: {'[' * 3000}{']' * 3000}": "50 deep",
+    "a: &a [*a]": "with its anchors expanded",
+}
 
 
 @pytest.mark.parametrize(
-    ("name", "content"),
+    ("name", "content", "message"),
     [
-        ("summary.json", '{"experiment": "weak", "seed": 1, "data": {"time_unit": "ages"}}'),
-        ("provenance.json", "[1]"),
-        ("config.yaml", "a: &a {b: *a}"),
+        ("summary.json", '{"experiment": "weak", "seed": 1, "data": {"time_unit": "ages"}}', ""),
+        ("summary.json", "[" * 100_000, "it is damaged"),
+        ("provenance.json", "[1]", ""),
+        ("provenance.json", '{"versions": "text"}', "it is damaged"),
+        *(("config.yaml", content, message) for content, message in CONFIGS.items()),
     ],
 )
-def test_a_damaged_run_folder_is_named(name: str, content: str, tmp_path: Path) -> None:
+def test_a_damaged_run_folder_is_named(
+    name: str, content: str, message: str, tmp_path: Path
+) -> None:
     for each, text in RUN.items():
         (tmp_path / each).write_text(text)
     assert read_run(tmp_path, 0).settings == {"seed": 1}
     (tmp_path / name).write_text(content)
-    with pytest.raises(ValueError, match=f"{name} cannot be read: "):
+    with pytest.raises(ValueError, match=f"{name} cannot be read: .*{message}"):
         read_run(tmp_path, 0)
+
+
+@pytest.mark.parametrize("content", CONFIGS)
+def test_a_config_is_counted_before_it_is_expanded(
+    content: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "conf" / "exp").mkdir(parents=True)
+    (tmp_path / "conf" / "exp" / "theirs.yaml").write_text(f"# @package _global_\n{content}\n")
+    assert re.search(rf"^error: .*theirs\.yaml .*{CONFIGS[content]}", ended("+exp=theirs"))
+
+
+def test_pictures_are_pngs_and_numbers_of_any_size_are_shown(tmp_path: Path) -> None:
+    (tmp_path / "a.png").write_bytes(b"x" * 99)
+    with pytest.raises(ValueError, match=r"a\.png must be a PNG, got b'xxxx"):
+        read_png(tmp_path / "a.png", "")
+    assert value_text("one/f_kHz", 1e308, SECONDS) == "-"
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes of POSIX")
 def test_a_pipe_is_refused_and_not_waited_for(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "a.csv")
     for path in (tmp_path / "a.csv", Path("/dev/zero")):
-        with pytest.raises(ValueError, match="a file or a folder must come"):
-            open_source(path)
+        for read in (open_source, read_bytes, check_regular):
+            with pytest.raises(ValueError, match="a file or a folder must come: .* is a pipe"):
+                read(path)
+    with pytest.raises(ValueError, match=r"a\.csv is a pipe"):
+        check_regular(tmp_path)
+
+
+@pytest.mark.skipif(not Path("/dev/null").exists(), reason="devices of POSIX")
+@pytest.mark.parametrize("place", [".zgroup", "I/.zarray", "I/.zattrs", "I/0", "more"])
+def test_a_zarr_store_holds_files_alone(place: str, tmp_path: Path) -> None:
+    """A device, of which nothing is read, in the place of a pipe, which would be waited for."""
+    path = tmp_path / "a.zarr"
+    xr.Dataset({"I": ("time", np.arange(5.0))}).to_zarr(path, consolidated=False, zarr_format=2)
+    assert open_source(path).names == ["I"]
+    (path / place).unlink(missing_ok=True)
+    (path / place).symlink_to("/" if place == "more" else "/dev/null")
+    with pytest.raises(ValueError, match=rf"a\.zarr cannot be read: .*{place} is a pipe, .* link"):
+        open_source(path)
+
+
+@pytest.mark.parametrize("leads", ["raw", "virtual", "linked"])
+def test_values_of_hdf5_lie_in_the_file_itself(leads: str, tmp_path: Path) -> None:
+    layout = h5py.VirtualLayout((5,), "f8")
+    layout[:] = h5py.VirtualSource(os.devnull, "x", (5,))
+    with h5py.File(tmp_path / "a.nc", "w") as file:
+        if leads == "raw":
+            file.create_dataset("x", (5,), "f8", external=[(os.devnull, 0, 40)])
+        elif leads == "virtual":
+            file.create_virtual_dataset("x", layout)
+        else:
+            file["x"] = h5py.ExternalLink(os.devnull, "/x")
+    for read in (open_source, ep.data.read_field, ep.thruster.Restart):
+        with pytest.raises(ValueError, match=r"a\.nc cannot be read: 'x' must lie in the file"):
+            read(tmp_path / "a.nc")
+
+
+def test_what_is_packed_is_counted_unpacked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    np.savez_compressed(tmp_path / "a.npz", x=np.zeros(10_000))
+    xr.Dataset({"x": ("time", np.zeros(10_000, "i1"))}).to_netcdf(tmp_path / "a.nc")
+    monkeypatch.setattr(memory, "UNCOUNTED", 0)
+    monkeypatch.setattr(memory, "free_bytes", lambda: 70_000)
+    with pytest.raises(ValueError, match=r"a\.npz cannot be read: 'x.npy' would take 8.01e-05 GB"):
+        open_source(tmp_path / "a.npz")
+    with pytest.raises(ValueError, match=r"a\.nc cannot be read: 'x' would take 8e-05 GB"):
+        read_array(open_source(tmp_path / "a.nc"), "x", "x")
+
+
+WAITS = """
+import threading
+from ep2sindy.app import main
+
+def command(arguments, conf):
+    threading.Thread(target=threading.Event().wait).start()  # as for a file that never comes
+    raise KeyboardInterrupt
+
+main.command = command
+main.main()
+"""
+
+
+def test_an_interrupted_run_ends_though_a_thread_waits() -> None:
+    done = subprocess.run([sys.executable, "-c", WAITS], capture_output=True, text=True, timeout=99)
+    assert (done.returncode, done.stderr.split(":")[0]) == (1, "interrupted")
 
 
 def test_an_array_is_counted_before_memory_is_asked_for(tmp_path: Path) -> None:

@@ -10,7 +10,9 @@ import pytest
 import xarray as xr
 
 import ep2sindy as ep
+from ep2sindy.data.readers import tables
 from ep2sindy.data.readers.registry import open_source
+from ep2sindy.trust import memory
 
 X = np.arange(20) * 250.5  # below a thousand, and above
 
@@ -166,6 +168,21 @@ def test_a_table_of_thousands_of_columns_is_read(tmp_path: Path) -> None:
     row = ",".join(f"{k}.5" for k in range(n))
     (tmp_path / "a.csv").write_text(f"t,{names}\n" + "".join(f"{k},{row}\n" for k in range(4)))
     assert open_source(tmp_path / "a.csv").read("c2999").values.tolist() == [2999.5] * 4
+
+
+def test_a_table_has_a_width_that_is_counted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "a.csv").write_text(("1," * 5000 + "1\n") * 4)
+    with pytest.raises(ValueError, match=r"a\.csv cannot be read: .*most 5000 columns, got 5001"):
+        open_source(tmp_path / "a.csv")
+    np.savez(tmp_path / "a.npz", **{f"x{k}": np.ones(2) for k in range(3)})
+    monkeypatch.setattr(memory.check_width, "__defaults__", (2,))
+    with pytest.raises(ValueError, match="must have at most 2 arrays, got 3: keep what you need"):
+        ep.inspect_file(tmp_path / "a.npz")
+    (tmp_path / "a.csv").write_text("t,x\n" + "1,2\n" * 9 + "," * (tables.MAX_LOOKED_AT + 1))
+    with pytest.raises(ValueError, match="at most 2097152 characters in a line, got 2097153"):
+        open_source(tmp_path / "a.csv")
 
 
 def twice(text: str, key: str) -> str:

@@ -19,6 +19,7 @@ import pandas as pd
 from omegaconf import OmegaConf
 
 from ep2sindy.app.arguments import JOBS
+from ep2sindy.app.config_files import check_config
 from ep2sindy.data.readers.source import damage_named
 from ep2sindy.library.units import SECONDS, Clock
 from ep2sindy.model.model import SparseModel
@@ -29,7 +30,7 @@ from ep2sindy.report.page import page_html
 from ep2sindy.report.picture import read_png
 from ep2sindy.report.results import in_words, value_text
 from ep2sindy.report.screen import Screen
-from ep2sindy.runtime.files import read_json, write_text
+from ep2sindy.runtime.files import read_bytes, read_json, write_text
 from ep2sindy.runtime.screen import say
 
 ABOUT = """Compares runs: settings that differ, headline figures, equations with their intervals.
@@ -94,7 +95,7 @@ def folders_of(path: Path) -> list[Path]:
     found = []
     for place in records:
         with damage_named(place):
-            record = {"error": "", "folder": "", **read_json(place.read_text("utf-8"))}
+            record = {"error": "", "folder": "", **read_json(read_bytes(place))}
             folder = Path(record["folder"])
         if record["error"] or not record["folder"]:
             say(f"left out: job {place.stem} failed: {record['error']}")
@@ -114,7 +115,7 @@ def read_run(folder: Path, number: int) -> ReadRun:
         reason = "it ended early, see its run.log" if (folder / "run.log").is_file() else "no run"
         raise ValueError(f"{folder} has no summary.json: {reason}; {_nearby(folder)}")
     with damage_named(folder / "summary.json"):
-        summary = read_json((folder / "summary.json").read_text("utf-8"))
+        summary = read_json(read_bytes(folder / "summary.json"))
         about = {"experiment": str(summary["experiment"]), "seed": str(summary["seed"])}
         about["warnings"] = str(len(summary.get("warnings", [])))
         headline = {
@@ -122,9 +123,10 @@ def read_run(folder: Path, number: int) -> ReadRun:
         }
         clock = Clock.of(summary.get("data", {}).get("time_unit", "s"))
     with damage_named(folder / "provenance.json"):
-        loaded = read_json((folder / "provenance.json").read_text("utf-8"))
-        provenance = {"commit": "-", "versions": {}, **loaded}
+        loaded = read_json(read_bytes(folder / "provenance.json"))
+        provenance = {"commit": "-", **loaded, "versions": {**loaded.get("versions", {})}}
     with damage_named(folder / "config.yaml"):
+        check_config(folder / "config.yaml")
         config: Any = OmegaConf.to_container(OmegaConf.load(folder / "config.yaml"))
         placed = [by_place(str(key), each) for key, each in config.items() if key != "output"]
     models = sorted((folder / "models").glob("[!.]*.json"))
@@ -144,9 +146,9 @@ def read_run(folder: Path, number: int) -> ReadRun:
 def _nearby(folder: Path) -> str:
     """Runs found below the folder, next to it, or in the output folder, for an error message."""
     for place in (folder, folder.parent, Path("outputs")):
-        found = sorted(path.parent for path in place.glob("**/summary.json"))[-3:]
+        found = sorted(p.parent for d in ("*", "*/*") for p in place.glob(f"{d}/summary.json"))
         if found:
-            return f"there are runs such as {', '.join(map(str, found))}"
+            return f"there are runs such as {', '.join(map(str, found[-3:]))}"
     return "the folder of a run is the one that it prints last"
 
 

@@ -19,6 +19,7 @@ from typing import Any
 
 import hydra
 from hydra import compose, initialize_config_dir
+from hydra._internal.sources_registry import SourcesRegistry
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.experimental.callback import Callback
@@ -28,6 +29,7 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from ep2sindy.app.arguments import COMMANDS, JOBS, explain, options_first
+from ep2sindy.app.config_files import FileConfigSource
 from ep2sindy.runtime.files import read_json, write_json
 from ep2sindy.runtime.screen import listed, near_words, plain, say
 from ep2sindy.runtime.threads import start_on_one_thread
@@ -40,6 +42,7 @@ def main() -> None:
     gc.set_threshold(100_000, 50, 100)  # imports make many objects that are never freed
     atexit.register(gc.freeze)  # a last collection over all of them takes a second
     end_as_interrupted()
+    SourcesRegistry.instance().types["file"] = FileConfigSource
     start_on_one_thread()
     # Errors are reported here, not in Hydra's words; and a file of the user's that is called like a
     # module of Python, such as signal.py, must not take its place in workers.
@@ -55,7 +58,8 @@ def main() -> None:
             "can use again with data.cache=PATH"
         ]
     except KeyboardInterrupt:
-        sys.exit("interrupted: files under their final names are whole")
+        say("interrupted: files under their final names are whole", error=True)
+        os._exit(1)  # at once: a thread that waits, as for a file, would keep the process
     if errors:
         why = errors[0] if len(errors) == 1 else f"{len(errors)} jobs failed"
         sys.exit(plain(f"error: {why}"))

@@ -75,10 +75,9 @@ def channel_length_m(attributes: Mapping[str, Any]) -> float | None:
     if "channel_m" in attributes:
         return float(attributes["channel_m"])
     try:
-        length = read_json(attributes["parameters"])["thruster"]["channel_length"]
-    except (KeyError, TypeError, ValueError):
+        return float(read_json(attributes["parameters"])["thruster"]["channel_length"])
+    except (KeyError, TypeError, ValueError, RecursionError):
         return None
-    return float(length)
 
 
 def grid_points(field: xr.Dataset, axis: str) -> Float[np.ndarray, " points"]:

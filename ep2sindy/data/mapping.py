@@ -27,6 +27,7 @@ from ep2sindy.data.readers.source import FileSource, damage_named
 from ep2sindy.data.readers.table_layout import unit_in_brackets
 from ep2sindy.library.names import check_variable
 from ep2sindy.runtime.screen import near_words
+from ep2sindy.trust.memory import check_memory
 
 N_MARKS = "n_marks"  # attribute of an array: number of samples that were marks of overload
 
@@ -118,6 +119,8 @@ def read_array(source: FileSource, ours: str, name: str) -> xr.DataArray:
         raise ValueError(f"{source.path} has no variable {name!r} (wanted as {ours}){near}")
     with damage_named(source.path):
         array = source.read(whole)
+        n_bytes = 8.0 * array.size if array.ndim < 2 else 0.0  # others are read in parts
+        check_memory(n_bytes, repr(name), hint="copy the part that you need into a file")
     if array.dtype.kind not in "fiub":
         raise ValueError(f"{name!r} in {source.path} must be real numbers, not {array.dtype}")
     try:

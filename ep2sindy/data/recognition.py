@@ -10,7 +10,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import count, permutations
+from itertools import count, product
 from math import isclose, prod
 from types import MappingProxyType
 
@@ -35,6 +35,7 @@ from ep2sindy.data.quantities import (
     words_of,
 )
 from ep2sindy.data.readers.source import FileSource
+from ep2sindy.trust.memory import check_width
 
 MAX_COLUMNS = 32  # an array of at most so many columns is split into separate signals
 
@@ -55,6 +56,7 @@ def recognise(
     states none. plasma: names such as Te mean quantities without a unit, and what has no unit is
     in SI.
     """
+    check_width(len(source.names), "arrays")
     arrays = _Arrays(source, [describe_array(source, name) for name in source.names], plasma)
     axes = arrays.axes(given)
     dt_s = arrays.step_s(axes.get("time")) if dt_s is None else dt_s
@@ -258,13 +260,13 @@ class _Arrays:
     def _long_table(self) -> str:
         """That a column runs through its values and starts anew at each value of another."""
         columns = {e.name: self.source.read(e.name).values for e in self.usable if e.falls}
-        for inner, outer in permutations(columns, 2):
-            starts = np.flatnonzero(np.diff(columns[outer])) + 1
-            n = int(starts[0]) if starts.size else 0
-            cuts = range(n, len(columns[outer]), n or 1)
-            blocks, runs = (np.split(columns[name], cuts) for name in (outer, inner))
-            stays = n > 1 and all(np.ptp(block) == 0.0 for block in blocks)
-            if stays and all(np.array_equal(run, runs[0]) for run in runs):
+        lengths: dict[int, str] = {}  # of the blocks in which a column stays -> the first such one
+        for outer, values in columns.items():
+            starts = np.flatnonzero(np.diff(values)) + 1
+            if starts.size and starts[0] > 1 and not (starts % starts[0]).any():
+                lengths.setdefault(int(starts[0]), outer)
+        for (inner, values), (n, outer) in product(columns.items(), lengths.items()):
+            if values.size % n == 0 and np.array_equal(values[n:], values[:-n]):
                 return (
                     f"the table is long: {inner!r} runs through {n} values and starts anew at each "
                     f"{outer!r}; make a field of it in Python, table.set_index(['{outer}', "

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from textwrap import fill
 from typing import Any
 
@@ -13,7 +12,7 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ep2sindy.data.fields import cell_edges
+from ep2sindy.data.fields import cell_edges, channel_length_m
 from ep2sindy.figures import style
 from ep2sindy.figures.maps import CM
 from ep2sindy.figures.style import COLOURS, DATA, GREY, TITLE, WIDTH
@@ -163,9 +162,9 @@ def _words(array: xr.DataArray) -> str:
 
 
 def _exit_cm(field: xr.Dataset) -> list[float]:
-    """The end of the channel, if the run gives its position."""
-    thruster = json.loads(field.attrs.get("parameters", "{}")).get("thruster", {})
-    return [CM * thruster["channel_length"]] if "channel_length" in thruster else []
+    """The end of the channel, if the field gives its position."""
+    length_m = channel_length_m(field.attrs)
+    return [] if length_m is None else [CM * length_m]
 
 
 def last_periods(t: Float[np.ndarray, " time"], f_kHz: float, periods: float) -> slice:

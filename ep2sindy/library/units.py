@@ -128,7 +128,7 @@ def unit_product(factors: Iterable[tuple[str, int | float]]) -> str:
 def with_prefix(value: float) -> tuple[float, str]:
     """Factor and SI prefix that bring a value between 1 and 1000: 1.4e4 -> (1e-3, "k")."""
     prefixes = {-9: "n", -6: "u", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}
-    power = 3 * math.floor(math.log10(value) / 3) if value > 0 else 0
+    power = 3 * math.floor(math.log10(value) / 3) if 0 < value < math.inf else 0
     power = min(max(power, -9), 9)
     return 10.0**-power, prefixes[power]
 

@@ -15,7 +15,7 @@ from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.library.functions import UnknownFunctionError
 from ep2sindy.library.library import Library, named_terms
 from ep2sindy.library.units import SECONDS, Clock
-from ep2sindy.runtime.files import read_json
+from ep2sindy.runtime.files import read_bytes, read_json
 from ep2sindy.runtime.screen import words_of
 
 FORMAT = "ep2sindy.SparseModel/1"
@@ -105,7 +105,7 @@ def read_stored(path: Path, read: Callable[[str], Model]) -> Model:
     Raises UnknownFunctionError or another ValueError.
     """
     try:
-        return read(path.read_text(encoding="utf-8"))
+        return read(read_bytes(path).decode("utf-8"))
     except UnknownFunctionError as error:
         raise UnknownFunctionError(f"{path}: {error}") from error
     except ValueError as error:

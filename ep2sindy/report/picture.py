@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import struct
 from base64 import b64encode
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from ep2sindy.runtime.files import read_bytes
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -49,9 +50,11 @@ def in_few_colours(png: bytes) -> bytes:
 
 
 def read_png(path: Path, caption: str) -> Drawn:
-    """A figure written by an earlier run."""
-    png = path.read_bytes()
-    width = struct.unpack(">I", png[16:20])[0]  # width in the PNG header
+    """A figure written by an earlier run. Raises ValueError for a file that is no PNG."""
+    png = read_bytes(path)
+    if not png.startswith(b"\x89PNG\r\n"):
+        raise ValueError(f"{path} must be a PNG, got {png[:8]!r}; take it out of the run's figures")
+    width = int.from_bytes(png[16:20], "big")  # width in the PNG header
     return Drawn(png_html(png), caption, round(width / DPI * PX_PER_INCH))
 
 

@@ -1,4 +1,4 @@
-"""Atomic writing of files, so that a final name never stands for a half-written file; JSON."""
+"""Atomic writing of files, so that a final name never stands for a half-written file; reading."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import uuid
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -114,11 +115,32 @@ def _without_nan(content: Any) -> Any:
     return content
 
 
-def read_json(text: str) -> Any:
+def check_regular(path: Path) -> None:
+    """Raise ValueError unless a path, and all below it, are files and folders, if it exists.
+
+    To open a pipe would wait forever. Below it links to folders are refused: they lead anywhere.
+    """
+    below = (os.path.join(at, n) for at, *names in os.walk(path) for n in chain(*names))
+    for place in chain([os.path.realpath(path)], below):
+        is_folder = os.path.isdir(place) and not os.path.islink(place)
+        if os.path.lexists(place) and not (os.path.isfile(place) or is_folder):
+            raise ValueError(
+                f"a file or a folder must come: {place} is a pipe, a socket, a device or a link "
+                "that leads to no file; replace it by a file"
+            )
+
+
+def read_bytes(path: Path) -> bytes:
+    """The content of a file. Raises ValueError for what is no file, OSError if it is not there."""
+    check_regular(path)
+    return path.read_bytes()
+
+
+def read_json(text: str | bytes) -> Any:
     """Parse JSON.
 
     Raises ValueError for text that is not JSON, and for an object that has a key twice, of which
-    Python's parser would silently drop the first.
+    Python's parser would silently drop the first; RecursionError for lists in lists without end.
     """
     return json.loads(text, object_pairs_hook=_each_once)
 

@@ -29,7 +29,7 @@ def in_line(text: str) -> str:
 
 
 # Errors whose words are about code, and tell nothing of a file.
-_INTERNAL = (AssertionError, AttributeError, IndexError, NameError, TypeError)
+_INTERNAL = (AssertionError, AttributeError, IndexError, NameError, RecursionError, TypeError)
 _IN_PYTHON = re.compile(r"NoneType|zip\(\)|no attribute|values to unpack")
 
 

@@ -1,4 +1,4 @@
-"""Check of memory before it is allocated: a process killed for lack of memory gives no message."""
+"""Check of memory and width before they are asked for: what is killed gives no message."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 
 UNCOUNTED = 2**28  # bytes up to which no check is made
+MAX_WIDTH = 5000  # arrays or columns of a file, each of which takes its time
 CGROUP = Path("/sys/fs/cgroup")
 
 
@@ -39,3 +40,12 @@ def check_memory(n_bytes: float, what: str, *, hint: str, each: float = 0.0) -> 
         f"{what} would take {n_bytes / 1e9:.3g} GB of memory: {free / 1e9:.3g} GB are free{fit}; "
         f"{hint}"
     )
+
+
+def check_width(n: int, what: str, limit: int = MAX_WIDTH) -> None:
+    """Raise ValueError for a file of more than `limit` columns, or whatever `what` names."""
+    if n > limit:
+        raise ValueError(
+            f"a file must have at most {limit} {what}, got {n}: keep what you need, and write a "
+            "grid as one array, in NetCDF"
+        )

@@ -170,9 +170,9 @@ def stored_array(path: Path, found: h5py.Dataset) -> xr.DataArray:
         raise ValueError(f"{found.name!r} is empty: its dataspace is null, and holds no values")
     if found.dtype.kind not in "iufb":
         return xr.DataArray(found[()])
-    # Read whole: a vector, as times are, and one mark for each chunk that says if it was written.
-    n_bytes = found.size * found.dtype.itemsize if found.ndim < 2 else prod(_counts(found))
-    check_memory(float(n_bytes), repr(found.name), hint="copy the part that you need into a file")
+    # One mark for each chunk says if it was written.
+    n_bytes = float(prod(_counts(found)))
+    check_memory(n_bytes, repr(found.name), hint="copy the part that you need into a file")
     stored = _Stored(path, found)
     if not stored.written.any():
         raise ValueError(f"{found.name!r} was never written: the file holds its shape alone")
@@ -187,7 +187,7 @@ def _written(found: h5py.Dataset) -> tuple[np.ndarray, tuple[int, ...]]:
     """Which chunks of a data set were written, over the grid of its chunks, and their shape."""
     chunks = found.chunks or tuple(max(n, 1) for n in found.shape)
     written = np.ones(_counts(found), dtype=bool)
-    if not found.size or not found.shape or found.dtype.kind not in "iuf" or found.is_virtual:
+    if not found.size or not found.shape or found.dtype.kind not in "iuf":
         return written, chunks
     if found.chunks is None:
         written[...] = found.id.get_storage_size() > 0

@@ -10,6 +10,7 @@ import xarray as xr
 
 from ep2sindy.data.readers.hdf5 import names_in_hdf5, stored_array
 from ep2sindy.data.readers.source import FileSource, Reader, leaves
+from ep2sindy.trust.memory import check_memory
 
 V73 = b"MATLAB 7.3"
 
@@ -63,6 +64,7 @@ def read_npz(path: Path) -> FileSource:
 
     with ZipFile(path) as archive:
         for member in archive.infolist():
+            check_memory(float(member.file_size), repr(member.filename), hint="divide it")
             if not member.filename.endswith(".npy"):
                 raise ValueError(
                     f"an archive must hold arrays of NumPy alone: it holds {member.filename!r}; "

@@ -9,6 +9,7 @@ from typing import Literal
 import xarray as xr
 
 from ep2sindy.data.readers.source import FileSource, Reader, dataset_source
+from ep2sindy.runtime.files import check_regular
 
 # Default fill values, which the netCDF library returns for numbers that were never written unless
 # an attribute sets another. Bytes have none. Source: netcdf.h, NC_FILL_SHORT and its kin.
@@ -49,6 +50,7 @@ def read_zarr(path: Path) -> FileSource:
 
     Pickled objects are refused by numcodecs, from the release on that the extra asks for.
     """
+    check_regular(path)
     dataset = xr.open_dataset(path, engine="zarr", consolidated=False, decode_cf=False)
     return dataset_source(path, dataset)
 

@@ -13,6 +13,7 @@ from ep2sindy.data.readers.matlab import MATLAB, NPZ
 from ep2sindy.data.readers.netcdf import NETCDF, ZARR
 from ep2sindy.data.readers.source import FileSource, Reader, damage_named, look_at
 from ep2sindy.data.readers.tables import CSV, NPY, TDMS
+from ep2sindy.runtime.files import check_regular
 from ep2sindy.runtime.screen import joined
 from ep2sindy.trust.memory import check_memory
 
@@ -46,8 +47,8 @@ def reader_of(path: Path) -> Reader:
     """
     if not path.exists():
         raise ValueError(f"no such file: {path.absolute()}")
-    if not (path.is_file() or path.is_dir()):  # opening a pipe would wait forever
-        raise ValueError(f"a file or a folder must come: {path} is a pipe, a socket or a device")
+    if not path.is_dir():
+        check_regular(path)
     if path.is_file() and path.stat().st_size == 0:
         raise ValueError(f"{path} is empty: it holds no bytes; was it written to the end?")
     form, head, ending = look_at(path)

@@ -102,7 +102,28 @@ def look_at(path: Path) -> tuple[Form, bytes, str]:
         head = file.read(16)
     if head.startswith(b"PK"):
         return "zip", head, ending
-    return "hdf5" if h5py.is_hdf5(path) else "other", head, ending
+    if not h5py.is_hdf5(path):
+        return "other", head, ending
+    with damage_named(path):
+        check_inside(path)
+    return "hdf5", head, ending
+
+
+def check_inside(path: Path) -> None:
+    """Raise ValueError if an HDF5 file leads to another one.
+
+    That may be anything, also a pipe, for which the library would wait forever.
+    """
+    import h5py
+
+    links: dict[str, object] = {}
+    with h5py.File(path) as file:
+        file.visititems_links(lambda name, link: links.update({name: link}))
+        for name, link in links.items():
+            item = file[name] if isinstance(link, h5py.HardLink) else None
+            is_apart = isinstance(item, h5py.Dataset) and (item.external or item.is_virtual)
+            if is_apart or isinstance(link, h5py.ExternalLink):
+                raise ValueError(f"{name!r} must lie in the file itself: copy its values into it")
 
 
 def plain(value: Any) -> Any:

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from itertools import zip_longest
 
 from ep2sindy.library.units import is_count, unit_like
+from ep2sindy.trust.memory import check_width
 
 SEPARATORS = (",", ";", "\t", "|", None)  # None: blanks
 COMMENTS = ("#", "%", "//", "!")
@@ -73,6 +74,7 @@ def layout_of(lines: Sequence[str]) -> Layout:
     before = [line for line in lines[:first] if line and not RULE.fullmatch(line)]
     above = _split([line.lstrip("#%!/ ") for line in before], separator)
     n_columns = max(map(len, below))
+    check_width(n_columns, "columns")
     if above and separator and len(above[-1]) == shown[first].count(separator) + 1:
         n_columns = max(n_columns, len(above[-1]))  # the last ones are empty in these lines
     is_comment = bool(before) and before[-1].startswith(COMMENTS)

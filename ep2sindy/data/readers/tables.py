@@ -5,7 +5,6 @@ from __future__ import annotations
 import codecs
 import re
 from collections.abc import Mapping, Sequence
-from itertools import islice
 from pathlib import Path
 from typing import TextIO
 
@@ -22,8 +21,10 @@ from ep2sindy.data.readers.table_layout import (
     Layout,
     layout_of,
 )
+from ep2sindy.trust.memory import check_width
 
 N_LOOKED_AT = 2000  # lines examined to find the layout; no known preamble is longer
+MAX_LOOKED_AT = 2**21  # characters of these lines, and of one line
 
 # Times of day; dates of ISO 8601, perhaps with one; and dates that may be read in two ways.
 CLOCK = r"\d\d?:\d\d(?::\d\d(?:[.,]\d+)?)?\s?(?:[AaPp][Mm])?"
@@ -49,7 +50,8 @@ def read_csv(path: Path) -> FileSource:
 
 
 def _source(path: Path, file: TextIO) -> FileSource:
-    lines = list(islice(file, N_LOOKED_AT))
+    lines = file.readlines(MAX_LOOKED_AT)[:N_LOOKED_AT]
+    check_width(max(map(len, lines), default=0), "characters in a line", MAX_LOOKED_AT)
     layout = layout_of(lines)
     if any(AT_TIMES in line for line in lines[: layout.first]):
         raise ValueError(

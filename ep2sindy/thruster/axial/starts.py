@@ -13,6 +13,7 @@ import numpy as np
 import xarray as xr
 from jaxtyping import Float
 
+from ep2sindy.data.readers.registry import reader_of
 from ep2sindy.data.readers.source import damage_named
 from ep2sindy.runtime.files import read_json
 from ep2sindy.thruster.axial.state_kernels import (
@@ -281,8 +282,7 @@ def stored_energy(state: AxialState, model: AxialModel) -> float:
 def _ended_run(run: xr.Dataset | str | Path) -> xr.Dataset:
     if not isinstance(run, xr.Dataset):
         path = Path(run)
-        if not path.is_file():
-            raise ValueError(f"no such run to continue from: {path.absolute()}")
+        reader_of(path)  # it must be there, and lead to no other file
         with (
             damage_named(path),
             xr.open_dataset(path, engine="h5netcdf", decode_times=False) as stored,
