@@ -159,20 +159,36 @@ def test_a_zarr_store_holds_files_alone(place: str, tmp_path: Path) -> None:
         open_source(path)
 
 
-@pytest.mark.parametrize("leads", ["raw", "virtual", "linked"])
-def test_values_of_hdf5_lie_in_the_file_itself(leads: str, tmp_path: Path) -> None:
+def leading(path: Path, leads: str, target: str) -> None:
+    """An HDF5 file whose data set x lies in another file."""
     layout = h5py.VirtualLayout((5,), "f8")
-    layout[:] = h5py.VirtualSource(os.devnull, "x", (5,))
-    with h5py.File(tmp_path / "a.nc", "w") as file:
+    layout[:] = h5py.VirtualSource(target, "x", (5,))
+    with h5py.File(path, "w") as file:
         if leads == "raw":
-            file.create_dataset("x", (5,), "f8", external=[(os.devnull, 0, 40)])
+            file.create_dataset("x", (5,), "f8", external=[(target, 0, 40)])
         elif leads == "virtual":
             file.create_virtual_dataset("x", layout)
         else:
-            file["x"] = h5py.ExternalLink(os.devnull, "/x")
+            file["x"] = h5py.ExternalLink(target, "/x")
+
+
+@pytest.mark.parametrize("leads", ["raw", "virtual", "linked", "twice"])
+def test_values_of_hdf5_lie_in_files(leads: str, tmp_path: Path) -> None:
+    leading(tmp_path / "a.nc", leads, "b.h5" if leads == "twice" else os.devnull)
+    leading(tmp_path / "b.h5", "raw", os.devnull)
     for read in (open_source, ep.data.read_field, ep.thruster.Restart):
-        with pytest.raises(ValueError, match=r"a\.nc cannot be read: 'x' must lie in the file"):
+        with pytest.raises(ValueError, match=r"a\.nc cannot be read: values must lie in files: it"):
             read(tmp_path / "a.nc")
+
+
+def test_values_of_hdf5_may_lie_in_another_file(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "b.h5", "w") as file:
+        file["x"] = np.arange(5.0)
+    for leads in ("virtual", "linked"):
+        leading(tmp_path / f"{leads}.h5", leads, "b.h5")
+    source = open_source(tmp_path / "virtual.h5")
+    np.testing.assert_array_equal(source.read("x"), np.arange(5.0))
+    assert not open_source(tmp_path / "linked.h5").names  # links are passed over
 
 
 def test_what_is_packed_is_counted_unpacked(

@@ -187,7 +187,7 @@ def _written(found: h5py.Dataset) -> tuple[np.ndarray, tuple[int, ...]]:
     """Which chunks of a data set were written, over the grid of its chunks, and their shape."""
     chunks = found.chunks or tuple(max(n, 1) for n in found.shape)
     written = np.ones(_counts(found), dtype=bool)
-    if not found.size or not found.shape or found.dtype.kind not in "iuf":
+    if not found.size or not found.shape or found.dtype.kind not in "iuf" or found.is_virtual:
         return written, chunks
     if found.chunks is None:
         written[...] = found.id.get_storage_size() > 0

@@ -109,21 +109,33 @@ def look_at(path: Path) -> tuple[Form, bytes, str]:
     return "hdf5", head, ending
 
 
-def check_inside(path: Path) -> None:
-    """Raise ValueError if an HDF5 file leads to another one.
+def check_inside(path: Path, above: frozenset[Path] = frozenset()) -> None:
+    """Raise ValueError if an HDF5 file, or one it leads to, leads to what is no file.
 
-    That may be anything, also a pipe, for which the library would wait forever.
+    That may be a pipe, for which the library would wait without end. above: files that led here.
     """
     import h5py
 
-    links: dict[str, object] = {}
+    targets: set[str] = set()
     with h5py.File(path) as file:
-        file.visititems_links(lambda name, link: links.update({name: link}))
-        for name, link in links.items():
+
+        def look(name: str, link: object) -> None:
+            if isinstance(link, h5py.ExternalLink):
+                targets.add(link.filename)
             item = file[name] if isinstance(link, h5py.HardLink) else None
-            is_apart = isinstance(item, h5py.Dataset) and (item.external or item.is_virtual)
-            if is_apart or isinstance(link, h5py.ExternalLink):
-                raise ValueError(f"{name!r} must lie in the file itself: copy its values into it")
+            if isinstance(item, h5py.Dataset):
+                targets.update(name for name, *_ in item.external or ())
+                targets.update(
+                    s.file_name for s in (item.virtual_sources() if item.is_virtual else ())
+                )
+
+        file.visititems_links(look)
+    beside = (folder / name for name in targets - {"."} for folder in (path.parent, Path()))
+    for place in (each for each in beside if each.exists() and each not in {path, *above}):
+        if not place.is_file():
+            raise ValueError(f"values must lie in files: it leads to {place}; copy them into it")
+        if h5py.is_hdf5(place):
+            check_inside(place, above | {path})
 
 
 def plain(value: Any) -> Any:
