@@ -12,13 +12,7 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import _hidden_names
 from ep2sindy.estimation import estimate, explanation
 from ep2sindy.estimation.explanation import Explanation
-from ep2sindy.estimation.hidden import (
-    Coupling,
-    couplings,
-    with_guess,
-    with_guesses,
-    with_guesses_by,
-)
+from ep2sindy.estimation.hidden import Coupling, couplings, with_guess, with_guess_by, with_guesses
 from ep2sindy.estimation.likelihood import TrajectoryFit, hessian_on, observe
 from ep2sindy.estimation.noise import noise_beside
 from ep2sindy.estimation.problem import EstimationProblem, by_run, scale_problem
@@ -226,7 +220,7 @@ def test_guesses_are_close_without_noise() -> None:
     inner = slice(20, -20)
     # The division is held back a little where the factor is small.
     assert np.corrcoef(guess[inner], truth[inner])[0, 1] > 0.98
-    (other,) = with_guesses_by(PLANE.model, run)
+    other = with_guess_by(PLANE.model, run)
     assert np.corrcoef(other.columns(["y"])[inner, 0], truth[inner])[0, 1] < -0.98
 
 

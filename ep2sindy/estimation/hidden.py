@@ -157,7 +157,7 @@ def with_guess(run: Trajectory, library: Library, ways: Sequence[Coupling]) -> T
     Each one explains what a regression on the states before it leaves of the rate that it enters.
     The rate of a single measured state is left to its hidden state as a whole.
     """
-    known, rates = _smoothings(run)[0]
+    known, rates = _smooth(run)
     whole = run.state_names[0] if len(run.state_names) == 1 else ""
     units = dict(run.units)
     for way in ways:
@@ -172,25 +172,14 @@ def with_guess(run: Trajectory, library: Library, ways: Sequence[Coupling]) -> T
     return _insert_states(run, known, units)
 
 
-def with_guesses_by(model: SparseModel, run: Trajectory) -> list[Trajectory]:
+def with_guess_by(model: SparseModel, run: Trajectory, *, follow: bool = False) -> Trajectory:
     """A run with the states that it lacks, as the equations of a model tell them from its rates.
 
-    There are as many guesses as ways to smooth the run.
+    follow: see `_smooth`.
     Raises ValueError if no equation of the known states tells one of the others alone, and
-    FailedTryError if no guess can be used.
+    FailedTryError if the guess cannot be used.
     """
-    found, failed = [], FailedTryError()
-    for known, rates in _smoothings(run):
-        try:
-            found.append(_guess_by(model, run, known, rates))
-        except FailedTryError as error:
-            failed = error
-    if not found:
-        raise failed
-    return found
-
-
-def _guess_by(model: SparseModel, run: Trajectory, known: Columns, rates: Columns) -> Trajectory:
+    known, rates = _smooth(run, follow=follow)
     lacking = [name for name in model.states if name not in run.state_names]
     units = dict(run.units) | {name: model.units.get(name, "1") for name in lacking}
     while lacking:
@@ -225,28 +214,22 @@ def _infer_state(
     return None
 
 
-def _smoothings(run: Trajectory) -> list[tuple[Columns, Columns]]:
+def _smooth(run: Trajectory, *, follow: bool = False) -> tuple[Columns, Columns]:
     """Smoothed states and the inputs, by name, and the rates of the states.
 
-    The likeliest smoother may take pulses for noise: first comes one that must follow them then.
+    follow: a signal that the likeliest smoother takes for noise, as it may take long records of
+    pulses, is smoothed by one that must follow its spectrum.
     """
+    found = KalmanSmoother().estimate(run.t, run.states)
+    smoothed, rates = found.smoothed.copy(), found.derivative.copy()
+    if follow:
+        for k in np.flatnonzero(found.noise_std > DROWNED * run.states.std(axis=0)).tolist():
+            x = run.states[:, [k]]
+            own = KalmanSmoother(coarsest_s=signal_memory_s(run.t, x[:, 0])).estimate(run.t, x)
+            smoothed[:, k], rates[:, k] = own.smoothed[:, 0], own.derivative[:, 0]
+    known = dict(zip(run.state_names, smoothed.T, strict=True))
     inputs = dict(zip(run.input_names, run.inputs.T, strict=True))
-    likeliest = KalmanSmoother().estimate(run.t, run.states)
-    found = [(likeliest.smoothed.T, likeliest.derivative.T)]
-    drowned = likeliest.noise_std > DROWNED * run.states.std(axis=0)
-    if drowned.any():
-        known, rates = (columns.copy() for columns in found[0])
-        for k in np.flatnonzero(drowned).tolist():
-            x = run.states[:, k]
-            follower = KalmanSmoother(coarsest_s=signal_memory_s(run.t, x))
-            own = follower.estimate(run.t, x[:, None])
-            known[k], rates[k] = own.smoothed[:, 0], own.derivative[:, 0]
-        found = [(known, rates), *found]
-    return [
-        (dict(zip(run.state_names, known, strict=True)) | inputs,
-         dict(zip(run.state_names, rates, strict=True)))
-        for known, rates in found
-    ]  # fmt: skip
+    return known | inputs, dict(zip(run.state_names, rates.T, strict=True))
 
 
 def _add_state(

@@ -221,20 +221,22 @@ def forecast(
     past = trajectory_of(history)
     times = _times(past.t, past.dt_s, horizon)
     known = past if fitted_to is None else trajectory_of(fitted_to)
-    estimator = calibrate(tune_estimator(model, known, measured=measured), known, seed=seed)
-    (ahead,) = draw_forecasts(
-        estimator, [estimator.filter(past)], past.t[-1:], times[None], inputs=inputs,
-        n_draws=check_count("n_draws", n_draws), seed=seed, clock=past.clock,
-    )  # fmt: skip
-    lost = np.isnan(ahead.states).any(axis=1)
-    if lost.any():
-        last_s = float(times[lost.argmax()] - past.t[-1])
-        raise ValueError(
-            f"a forecast must be of numbers: all {n_draws} runs of the model diverge within "
-            f"{last_s:.4g} s after the history's end; ask for a shorter horizon, give the record "
-            "that the model was fitted to (fitted_to=...), or take another model"
-        )
-    return ahead
+    for follow in (False, True):
+        tuned = tune_estimator(model, known, measured=measured, follow=follow)
+        estimator = calibrate(tuned, known, seed=seed)
+        (ahead,) = draw_forecasts(
+            estimator, [estimator.filter(past)], past.t[-1:], times[None], inputs=inputs,
+            n_draws=check_count("n_draws", n_draws), seed=seed, clock=past.clock,
+        )  # fmt: skip
+        lost = np.isnan(ahead.states).any(axis=1)
+        if not lost.any():
+            return ahead
+    last_s = float(times[lost.argmax()] - past.t[-1])
+    raise ValueError(
+        f"a forecast must be of numbers: all {n_draws} runs of the model diverge within "
+        f"{last_s:.4g} s after the history's end; ask for a shorter horizon, give the record that "
+        "the model was fitted to (fitted_to=...), or take another model"
+    )
 
 
 def _times(t: np.ndarray, step_s: float, horizon: float | ArrayLike) -> np.ndarray:

@@ -19,9 +19,10 @@ from ep2sindy.data.coerce import own_result
 from ep2sindy.data.runs import Run, trajectory_of
 from ep2sindy.data.sensor import Bounds
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.estimation.hidden import with_guesses_by
+from ep2sindy.estimation.hidden import with_guess_by
 from ep2sindy.estimation.kernels import filter_states
 from ep2sindy.estimation.likelihood import (
+    FAR,
     FREE_START,
     TrajectoryFit,
     enough_substeps,
@@ -132,10 +133,8 @@ class StateEstimator:
 
         history: has the measured states of the model; others that it has only start the fit.
         """
-        guesses = _guess_states(self.model, history)
-        records = [self.problem.record(own).end(self.memory) for own in guesses]
-        fits = [(self.fit_path(record, record.samples), record) for record in records]
-        fit, record = min(fits, key=lambda pair: pair[0].total)
+        record = self.problem.record(_select_variables(self.model, history)).end(self.memory)
+        fit = self.fit_path(record, record.samples)
         _, mean, covariance = filter_states(*linearise(fit))
         end, scale = fit.path[-1] + mean, self.problem.scale
         if not (np.isfinite(end).all() and np.isfinite(covariance).all()):
@@ -143,19 +142,23 @@ class StateEstimator:
             end, covariance = record.samples[-1], FREE_START * np.eye(len(scale))
         return FittedState(scale * end, np.outer(scale, scale) * covariance)
 
+    def follows(self, history: Trajectory) -> bool:
+        """Whether the likeliest states come close to the last samples of a history."""
+        record = self.problem.record(_select_variables(self.model, history)).end(self.memory)
+        n_squares = len(record.samples) * self.measured.sum()
+        return bool(self.fit_path(record, record.samples).total < FAR * n_squares)
+
     def smooth(self, run: Trajectory) -> Trajectory:
         """All states of the model along a run, fitted to the measured ones under the errors.
 
         Between gaps it starts anew. Segments of under five samples are left out.
         """
-        guesses = _guess_states(self.model, run)
-        tried = [self.problem.record(own).segments() for own in guesses]
-        fits = [[self.fit_path(piece, piece.samples) for piece in pieces] for pieces in tried]
-        best = int(np.argmin([sum(fit.total for fit in own) for own in fits]))
-        own, pieces = guesses[best], tried[best]
+        own = _select_variables(self.model, run)
         whole = self.problem.record(own)
+        pieces = whole.segments()
+        paths = [self.fit_path(piece, piece.samples).path for piece in pieces]
         kept = np.isin(whole.times, np.concatenate([piece.times for piece in pieces]))
-        states = np.concatenate([fit.path for fit in fits[best]]) * self.problem.scale
+        states = np.concatenate(paths) * self.problem.scale
         with own_result("the model does not follow the record"):
             return replace(own, t=own.t[kept], states=states, inputs=own.inputs[kept])
 
@@ -190,6 +193,7 @@ def tune_estimator(
     run: Trajectory,
     *,
     measured: Sequence[str] | None = None,
+    follow: bool = False,
     progress: bool | Progress = False,
 ) -> StateEstimator:
     """Estimate with what errors a model follows a record, usually the one that it was fitted to.
@@ -197,7 +201,9 @@ def tune_estimator(
     run: has the measured states and the inputs of the model. measured: states whose samples count;
     others that the run has were made from them. None means all that it has. Every state may have
     process noise, also one whose equation is known to hold, such as x' = v: the others' errors come
-    in through it. progress: True shows a bar.
+    in through it. follow: guess the other states by a smoother that must follow the spectrum of the
+    samples; False does so only where the likeliest smoother, which may take pulses for noise, gives
+    states that come nowhere near them. progress: True shows a bar.
     Raises ValueError for a run without an input or of under five samples, or measured states that
     the model lacks.
     """
@@ -210,19 +216,18 @@ def tune_estimator(
             f"{run.n_samples}; pass the record that the model was fitted to, fitted_to=..."
         )
     end = run.window(max(0, run.n_samples - MAX_FITTED), run.n_samples)
-    guesses, watch = _guess_states(model, end), as_progress(progress)
-    begun, tried = _begin(model, guesses[0], names), []
-    for own in guesses:
-        estimator, deviance = begun, np.inf
-        paths = [record.samples for record in begun.problem.of([own]).records]
-        for _ in count_pieces(watch, range(N_PASSES), "pass", "errors of the model, for forecasts"):
-            estimator, paths, deviance = _with_likely_noise(estimator, paths)
-        tried.append((np.nan_to_num(deviance, nan=np.inf), estimator))
-    return min(tried, key=lambda pair: pair[0])[1]
+    watch = as_progress(progress)
+    if not follow:
+        estimator = _tune(model, _select_variables(model, end), names, watch)
+        if len(measured_states(model, end)) == len(model.states) or estimator.follows(end):
+            return estimator
+    return _tune(model, _select_variables(model, end, follow=True), names, watch)
 
 
-def _begin(model: SparseModel, own: Trajectory, names: Sequence[str]) -> StateEstimator:
-    """An estimator with a first guess of the noise; states that are guessed set their scale."""
+def _tune(
+    model: SparseModel, own: Trajectory, names: Sequence[str], watch: Progress
+) -> StateEstimator:
+    """An estimator for a record of all states, which sets their scale."""
     known = {state: [*terms] for state in model.states if (terms := model.terms(state))}
     problem = scale_problem([own], model.library.only(known), measured=names, courses=model.courses)
     paths, free = [record.samples for record in problem.records], _free_of(model, problem)
@@ -230,7 +235,7 @@ def _begin(model: SparseModel, own: Trajectory, names: Sequence[str]) -> StateEs
     differences = np.concatenate([np.diff(path, n=3, axis=0) for path in paths])
     rough = np.sqrt(np.square(differences).mean(axis=0) / 20.0)
     rough = np.clip(rough, LEAST_NOISE, MOST)
-    return StateEstimator(
+    estimator = StateEstimator(
         model=model,
         problem=problem,
         free=free,
@@ -239,6 +244,9 @@ def _begin(model: SparseModel, own: Trajectory, names: Sequence[str]) -> StateEs
         noise=_noise_of(problem, rough, 0.1 * rough),
         widths=BandWidths(np.ones(1), np.ones((1, len(model.states)))),
     )
+    for _ in count_pieces(watch, range(N_PASSES), "pass", "errors of the model, for forecasts"):
+        estimator, paths = _with_likely_noise(estimator, paths)
+    return estimator
 
 
 @one_thread()
@@ -290,18 +298,15 @@ def estimate_states(
 
 def _with_likely_noise(
     estimator: StateEstimator, paths: Sequence[np.ndarray]
-) -> tuple[StateEstimator, list[np.ndarray], float]:
-    """The estimator with the most likely noise about the states, and these states, by segment.
-
-    And -2 log likelihood of the samples.
-    """
+) -> tuple[StateEstimator, list[np.ndarray]]:
+    """The estimator with the most likely noise about the states, and these states, by segment."""
     records = estimator.problem.records
     paths = [estimator.fit_path(*pair).path for pair in zip(records, paths, strict=True)]
     samples, process = estimator.scaled_noise()
     fit = _fix(estimator.problem, records, paths, estimator.free, samples)
     fit = replace(fit, n_substeps=estimator.n_substeps, process_noise=process)
-    *errors, deviance = likely_errors(fit)
-    return replace(estimator, noise=_noise_of(estimator.problem, *errors)), paths, deviance
+    likely = _noise_of(estimator.problem, *likely_errors(fit)[:2])
+    return replace(estimator, noise=likely), paths
 
 
 def _fix(
@@ -337,21 +342,22 @@ def measured_states(model: SparseModel, run: Trajectory) -> list[str]:
     return found
 
 
-def _guess_states(model: SparseModel, run: Trajectory) -> list[Trajectory]:
-    """The variables of a run that a model has, in its order, by each guess of states it lacks."""
-    lacks = len(measured_states(model, run)) < len(model.states)
-    return [
-        Trajectory(
-            t=each.t,
-            states=each.columns(model.states),
-            state_names=tuple(model.states),
-            inputs=each.columns(model.inputs),
-            input_names=model.inputs,
-            units=each.units,
-            clock=each.clock,
-        )
-        for each in (with_guesses_by(model, run) if lacks else [run])
-    ]
+def _select_variables(model: SparseModel, run: Trajectory, *, follow: bool = False) -> Trajectory:
+    """The variables of a run that a model has, in its order; states that it lacks are guessed.
+
+    follow: see `with_guess_by`.
+    """
+    if len(measured_states(model, run)) < len(model.states):
+        run = with_guess_by(model, run, follow=follow)
+    return Trajectory(
+        t=run.t,
+        states=run.columns(model.states),
+        state_names=tuple(model.states),
+        inputs=run.columns(model.inputs),
+        input_names=model.inputs,
+        units=run.units,
+        clock=run.clock,
+    )
 
 
 def _free_of(model: SparseModel, problem: EstimationProblem) -> Float[np.ndarray, " free"]:
