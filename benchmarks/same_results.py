@@ -49,8 +49,7 @@ TOYS: dict[str, list[str]] = {
     ],
     "weak_windows": [
         "+exp=weak_windows", "fits.boxes.n_windows=[100,300]", "fits.boxes.n_points=[10,30]",
-        "noises=[0.0,0.1]",
-        "n_realizations=2", "parallel=serial",
+        "noises=[0.0,0.1]", "n_realizations=2", "parallel=serial",
     ],
     "frontier": [
         "+exp=frontier", "variants=[STLSQ,ours]", "rates_Hz=[1,20]", "durations_s=[5,40]",

@@ -112,11 +112,7 @@ def alternation_eV(label: str, *, n_steps: int = 4000) -> float:
         ep.thruster.Thruster(), POINTS[label], initial=run, averaged=False, sample_s=1.5e-8,
         duration_s=1.5e-8 * n_steps, warm_up_s=0.0, progress=False,
     )  # fmt: skip
-    return lasting_swing(steps["T_e_eV"].values.astype(float))
-
-
-def lasting_swing(T: np.ndarray) -> float:
-    """Largest half swing of a column of (steps, cells) that turns in every one of five steps."""
+    T = steps["T_e_eV"].values.astype(float)  # (steps, cells)
     windows = np.lib.stride_tricks.sliding_window_view(np.diff(T, axis=0), 5, axis=0)
     in_turn = np.all(windows[..., 1:] * windows[..., :-1] < 0.0, axis=-1)
     return float(np.max(0.5 * np.abs(windows).min(axis=-1), where=in_turn, initial=0.0))

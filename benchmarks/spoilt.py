@@ -132,9 +132,7 @@ def spoilt(name: str, kind: str, number: int, noise: float) -> tuple[System, Tra
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description="records spoilt on purpose")
     parser.add_argument("--kinds", nargs="+", default=list(KINDS), choices=list(KINDS))
     parser.add_argument("--n", type=int, default=5)
     parser.add_argument("--align", action="store_true", help="bring delayed channels together")

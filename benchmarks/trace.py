@@ -83,9 +83,8 @@ def main() -> None:
         clean = current(point)
         for seed in range(arguments.seeds):
             for record, run in {"clean": clean, "scope": as_measured(clean, seed)}.items():
-                found = {"point": point, "record": record, "seed": seed} | row(clean, run, seed)
-                rows.append(found)
-                print(found, flush=True)
+                labels = {"point": point, "record": record, "seed": seed}
+                rows.append(labels | row(clean, run, seed))
     print(pd.DataFrame(rows).to_string(index=False, float_format=lambda x: f"{x:.3g}"))
 
 
