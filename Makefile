@@ -62,7 +62,6 @@ docs-numbers: .venv/installed
 	$(BIN)/python -m tests.rerun $(PAGES)
 
 benchmark: .venv/installed
-	$(BIN)/python -m benchmarks.startup
 	$(BIN)/python -m benchmarks.search
 	$(BIN)/python -m benchmarks.simulator_2d
 	$(BIN)/python -m benchmarks.source
@@ -73,7 +72,6 @@ benchmark: .venv/installed
 	$(BIN)/python -m benchmarks.pointwise
 	$(BIN)/python -m benchmarks.regimes
 	$(BIN)/python -m benchmarks.points family
-	$(BIN)/python -m benchmarks.trajectory_scores
 
 clean:
 	rm -rf .venv .venv-lowest site .cache .mypy_cache .ruff_cache .pytest_cache

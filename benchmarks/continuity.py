@@ -43,10 +43,7 @@ def line(name: str, overrides: Sequence[str], speed: float) -> str:
     words = []
     for term, values in factors.items():
         off = np.abs(values - 1.0)
-        within = [
-            f"{int((off < fraction).sum())} within {fraction:.0%}"
-            for fraction in (0.03, 0.05, 0.15)
-        ]
+        within = [f"{int((off < limit).sum())} within {limit:.0%}" for limit in (0.03, 0.05, 0.15)]
         words.append(f"{term} {', '.join(within)}")
     least = found["r2_test"].min().item()
     return f"{name}: {found.sizes['z']} points; {'; '.join(words)}; R2 {least:.3f} or more"

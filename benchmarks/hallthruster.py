@@ -1,9 +1,9 @@
 """Agreement with stored runs of HallThruster.jl v0.22: `python -m benchmarks.hallthruster`.
 
-Its spt100 tutorial and its two calibrated SPT-100, and LANDMARK's fluid cases at N = 200 with its
-inner radius (these need EP2SINDY_DATA=folder with the benchmark's own landmark_rates.csv). Means
-over 1.5 to 2 ms; what is theirs lies in tests/data, with its source. Prints the table of
-docs/thruster.md; tests/test_hallthruster_agreement.py holds it.
+Its spt100 tutorial and its two calibrated SPT-100, read from inputs as theirs, and LANDMARK's fluid
+cases at N = 200 with its inner radius (these need EP2SINDY_DATA=folder with the benchmark's own
+landmark_rates.csv). Means over 1.5 to 2 ms; what is theirs lies in tests/data, with its source.
+Prints the table of docs/thruster.md; tests/test_hallthruster_agreement.py holds it.
 """
 
 from __future__ import annotations
@@ -11,9 +11,10 @@ from __future__ import annotations
 import json
 import math
 import os
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 from unittest.mock import patch
 
@@ -22,28 +23,14 @@ import xarray as xr
 import yaml
 
 import ep2sindy as ep
+from benchmarks.hallthruster_input import simulate_hallthruster_input
 from benchmarks.landmark import LANDMARK_POINT, landmark_thruster, read_landmark_rates
 from ep2sindy.signals.spectrum import dominant_frequency
-from ep2sindy.thruster import (
-    AnodeSheath,
-    AnomalousTransport,
-    Background,
-    GaussianTransport,
-    MagneticFieldTable,
-    OperatingPoint,
-    PressureShift,
-    ThermalPlume,
-    Thruster,
-    propellant,
-    wall_material,
-)
 from ep2sindy.thruster.axial import simulate as axial
 from ep2sindy.thruster.axial.model import build_model as axial_model
 from ep2sindy.thruster.axial.state_kernels import AxialModel
 from ep2sindy.thruster.constants import K_BOLTZMANN, M_XENON
-from ep2sindy.thruster.transport import Transport
 
-TORR = 101325.0 / 760.0  # Pa
 ROOT = Path(__file__).parents[1]
 DATA = ROOT / "tests" / "data"
 SPT100 = ROOT / "conf" / "thruster" / "spt100.yaml"
@@ -67,6 +54,36 @@ DECAY = -1.8e3  # 1/s, of the oscillation of LANDMARK case 2
 PROFILES = ("n_i", "n_n", "T_e_eV", "E_z")
 
 
+def _calibrated(
+    voltage: float, coupling_V: float, loss_scale: float, ingestion: float, **gaussian: float
+) -> dict[str, Any]:
+    """A calibrated input of theirs, whose transport the background's pressure shifts."""
+    return {
+        "discharge_voltage": voltage, "cathode_coupling_voltage": coupling_V,
+        "propellants": [{"gas": "Xenon", "max_charge": 3, "flow_rate_kg_s": 5e-6}],
+        "transition_length": 4.174e-3, "cathode_Tev": 3.26173, "anode_Tev": 3.26173,
+        "ion_wall_losses": True, "electron_ion_collisions": True, "solve_plume": True,
+        "background_pressure_Torr": 1e-5, "background_temperature_K": 300.0,
+        "neutral_ingestion_multiplier": ingestion,
+        "wall_loss_model": {"type": "WallSheath", "material": "BNSiO2", "loss_scale": loss_scale},
+        "anom_model": {
+            "type": "LogisticPressureShift", "model": {"type": "GaussianBohm", **gaussian},
+            "z0": -0.17682, "dz": 0.3594, "pstar": 4.735361e-05, "alpha": 15.0,
+        },
+    }  # fmt: skip
+
+
+CALIBRATED = {
+    "baseline": _calibrated(
+        300.0, 30.0, 0.86904, 6.23341,
+        hall_min=0.007015845, hall_max=0.0702476, center=0.02506, width=0.0065,
+    ),
+    "withplume": _calibrated(
+        400.0, 35.0, 0.5, 6.0, hall_min=0.00625, hall_max=0.0625, center=0.026, width=0.005,
+    ) | {"apply_thrust_divergence_correction": True},
+}  # fmt: skip
+
+
 def stored(name: str) -> dict[str, np.ndarray]:
     """Columns of a file in tests/data."""
     lines = [line for line in (DATA / name).read_text().splitlines() if not line.startswith("#")]
@@ -88,85 +105,26 @@ def deviations(mean: xr.Dataset, reference: dict[str, np.ndarray]) -> dict[str, 
     return found
 
 
-def spt100(
-    transport: Transport, walls: tuple[float, float], transition: float, T_e_eV: float, **more: Any
-) -> Thruster:
-    """Their SPT-100, its magnetic field that of thruster=spt100.
+def tutorial_run() -> xr.Dataset:
+    """Their tutorial from an input file as theirs."""
+    xenon = {"gas": "Xenon", "max_charge": 1, "flow_rate_kg_s": 5e-6}
+    return spt100_run({"propellants": [xenon], "discharge_voltage": 300}, n_cells=100)
 
-    walls: factors on the losses of electrons and ions. T_e_eV: at both ends. The conductivity is
-    Mitchner & Kruger's (Partially Ionized Gases, 1973, p. 94): 2.4/(1 + nu_ei/(sqrt(2) nu)), and
-    multiplies the gradient of 1.5 T_e there.
-    """
+
+def spt100_run(config: dict[str, Any], n_cells: int, duration_s: float = 2e-3) -> xr.Dataset:
+    """An SPT-100 from an input file as theirs, its magnetic field that of thruster=spt100."""
     field = yaml.safe_load(SPT100.read_text())["magnetic_field"]
-    return Thruster(
-        domain_length=0.08,
-        magnetic_field=MagneticFieldTable(field["distance"], field["B"]),
-        transport=transport,
-        propellant=propellant("xenon_5eV"),
-        wall=wall_material(
-            "BN-SiO2", electron_scale=walls[0], ion_scale=walls[1], plume_collisions=0.0,
-            transition=transition,
-        ),
-        anode=AnodeSheath(T_e_eV, potential_weight=2.0),
-        cathode_T_e_eV=T_e_eV,
-        series_resistance=0.0,
-        conduction_factor=1.5 * 2.4,
-        conduction_coulomb=2.0**-0.5,
-        **more,
-    )  # fmt: skip
-
-
-def tutorial() -> tuple[Thruster, OperatingPoint]:
-    """Their tutorial, with their defaults."""
-    transport = AnomalousTransport(1 / 160, 1 / 16, 2.5e-3)
-    thruster = spt100(transport, (1.0, 0.0), 2.5e-3, 2.0, charge_states=1, cathode_potential=0.0)
-    return thruster, OperatingPoint(300.0, 5.0, 150.0)
-
-
-@dataclass(frozen=True)
-class Calibrated:
-    """One of their calibrated SPT-100, in their numbers: c far away and in its trough, m, V."""
-
-    voltage: float
-    coupling: float
-    c: tuple[float, float]
-    center: float
-    width: float
-    loss_scale: float
-    ingestion: float
-    axial_thrust: bool
-
-    @property
-    def parts(self) -> tuple[Thruster, OperatingPoint]:
-        """With three charges and background gas, whose Torr are taken for Pa as it is ingested."""
-        transport = PressureShift(
-            GaussianTransport(*self.c, center=self.center - 0.025, width=self.width),
-            z0=-0.17682, dz=0.3594, pressure_Pa=TORR * 4.735361e-05, alpha=15.0,
-        )  # fmt: skip
-        thruster = spt100(
-            transport, (self.loss_scale, self.loss_scale), 4.174e-3, 3.26173, charge_states=3,
-            cathode_potential=self.coupling, plume=ThermalPlume(axial_thrust=self.axial_thrust),
-        )  # fmt: skip
-        background = Background(1e-5 * TORR, ingestion=self.ingestion / TORR)
-        return thruster, OperatingPoint(self.voltage, 5.0, 150.0, background=background)
-
-
-CALIBRATED = {
-    "baseline": Calibrated(
-        300.0, 30.0, (0.0702476, 0.007015845), 0.02506, 0.0065, 0.86904, 6.23341, False
-    ),
-    "withplume": Calibrated(400.0, 35.0, (0.0625, 0.00625), 0.026, 0.005, 0.5, 6.0, True),
-}
-
-
-def spt100_run(
-    parts: tuple[Thruster, OperatingPoint], n_cells: int, duration_s: float = 2e-3
-) -> xr.Dataset:
-    """A thruster at its point, on their grid and from their start."""
-    return ep.thruster.simulate(
-        *parts, duration_s=duration_s, warm_up_s=0.0, n_cells=n_cells, stretch=1.0,
-        coldest_T_e_eV=1.5, progress=False,
-    )  # fmt: skip
+    table = {"z": [0.025 + distance for distance in field["distance"]], "B": field["B"]}
+    geometry = {"inner_radius": 0.035, "outer_radius": 0.05, "channel_length": 0.025}
+    thruster = {"geometry": geometry, "magnetic_field": table}
+    given = {
+        "config": {"thruster": thruster, "domain": [0.0, 0.08], **config},
+        "simulation": {"duration": duration_s, "grid": {"type": "EvenGrid", "num_cells": n_cells}},
+    }
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "spt100.json"
+        path.write_text(json.dumps(given))
+        return simulate_hallthruster_input(path, sample_s=1.5e-6, progress=False)
 
 
 def calibrated_run(
@@ -185,7 +143,7 @@ def calibrated_run(
         return model._replace(neutral_before=before, neutral_behind=behind)
 
     with patch.object(axial, "build_model", build_model if neutrals_stay else axial_model):
-        return spt100_run(CALIBRATED[name].parts, n_cells, duration_s)
+        return spt100_run(CALIBRATED[name], n_cells, duration_s)
 
 
 def figures(run: xr.Dataset) -> dict[str, float]:
@@ -252,7 +210,7 @@ def percent(off: dict[str, float]) -> str:
 
 
 def main() -> None:
-    run = spt100_run(tutorial(), 100)
+    run = tutorial_run()
     current = late(run)["I_d"]
     print(
         f"spt100 tutorial: I_d {float(current.mean()):.3f} A, std {float(current.std()):.2f} "
@@ -269,10 +227,7 @@ def main() -> None:
             line = ", ".join(f"{k} {ours[k]:.2f} ({v})" for k, v in theirs.items())
             line += f"; mass balance {run.attrs['mass_balance']:.4f}"
             if name == "withplume":
-                fractions = n_i_over_theirs(run)
-                line += (
-                    f"; n_i over theirs {', '.join(f'{fraction:.2f}' for fraction in fractions)}"
-                )
+                line += f"; n_i over theirs {', '.join(f'{f:.2f}' for f in n_i_over_theirs(run))}"
             print(f"{name}, {kind}: {line}")
     if not RATE_TABLE.exists():
         print("LANDMARK: name the folder of landmark_rates.csv with EP2SINDY_DATA")

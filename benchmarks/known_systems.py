@@ -61,9 +61,8 @@ def lorenz_96(n: int, forcing: float = 8.0) -> dict[str, dict[str, float]]:
     }
 
 
-# Rossler 1976; Duffing without forcing; FitzHugh 1961; Lorenz 1984; Prigogine & Lefever
-# 1968; Halvorsen; Chua with a cubic resistor; Lorenz 1996;
-# Rossler 1979 with two growing directions.
+# Rossler 1976; Duffing without forcing; FitzHugh 1961; Lorenz 1984; Prigogine & Lefever 1968;
+# Halvorsen; Chua with a cubic resistor; Lorenz 1996; Rossler 1979 with two growing directions.
 OTHERS: Mapping[str, Known] = {
     "rossler": Known(
         {

@@ -65,13 +65,15 @@ class TabulatedRates(XenonFits):
 
 @dataclass(frozen=True)
 class ExponentialWall:
-    """Wall loss 1e7 alpha eps exp(-20/eps) with eps = 1.5 T_e, as LANDMARK defines it.
+    """Wall loss 1e7 alpha eps exp(-U/eps) with eps = 1.5 T_e, as LANDMARK defines it at U = 20 V.
 
-    alpha: in the channel; it is 1 in the plume. Electrons collide with the channel wall at 1e7 1/s;
-    ions never do. Source: LANDMARK, test case 3.
+    alpha: in the channel and in the plume. Electrons collide with the channel wall at 1e7 1/s; ions
+    never do. transition: as for `SheathWall`, in m. Source: LANDMARK, test case 3.
     """
 
-    alpha: float
+    alpha: tuple[float, float]
+    sheath_V: float = 20.0
+    transition: float = 0.0
 
     def ion_loss(self, T_e_eV: FloatArray, gap: float, ion_mass: float) -> FloatArray:
         """No ion reaches the wall."""
@@ -83,19 +85,19 @@ class ExponentialWall:
 
     def power(self, T_e_eV: FloatArray, gap: float, ion_mass: float) -> FloatArray:
         """Power lost to the wall per electron, in eV/s."""
-        return FREQUENCY * 1.5 * T_e_eV * np.exp(-20.0 / (1.5 * T_e_eV))
+        return FREQUENCY * 1.5 * T_e_eV * np.exp(-self.sheath_V / (1.5 * T_e_eV))
 
     def ion_weight(self, distance: Float[np.ndarray, " z"]) -> Float[np.ndarray, " z"]:
         """1 in the channel and 0 in the plume, but the ion loss itself is zero."""
-        return fraction(distance, 1.0, 0.0, 0.0)
+        return fraction(distance, 1.0, 0.0, self.transition)
 
     def collision_weight(self, distance: Float[np.ndarray, " z"]) -> Float[np.ndarray, " z"]:
         """Fraction of the wall collisions: electrons collide in the channel only."""
-        return fraction(distance, 1.0, 0.0, 0.0)
+        return fraction(distance, 1.0, 0.0, self.transition)
 
     def power_weight(self, distance: Float[np.ndarray, " z"]) -> Float[np.ndarray, " z"]:
         """alpha at a distance from the exit in m, negative inside."""
-        return fraction(distance, self.alpha, 1.0, 0.0)
+        return fraction(distance, *self.alpha, self.transition)
 
 
 def landmark_thruster(case: int, rates: TabulatedRates) -> Thruster:
@@ -107,7 +109,7 @@ def landmark_thruster(case: int, rates: TabulatedRates) -> Thruster:
     return Thruster(
         transport=AnomalousTransport(c_channel=1 / 160, c_plume=1 / 16, transition=1e-3),
         propellant=rates,
-        wall=ExponentialWall(ALPHA_CHANNEL[case]),
+        wall=ExponentialWall((ALPHA_CHANNEL[case], 1.0)),
         ion_temperature=0.0,
         anode=FixedAnode(T_e_eV=2.0),
         cathode_T_e_eV=2.0,

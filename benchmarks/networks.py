@@ -11,7 +11,6 @@ that was found under roles are followed: how many turn negative.
 from __future__ import annotations
 
 import argparse
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -135,17 +134,15 @@ def n_negative(model: ep.SparseModel, network: Network) -> int:
 def counts(name: str, network: Network, noise: float, n: int) -> None:
     """Print how many of n records give the true terms, with roles and without."""
     library, right, negative = ep.polynomial(list(network.equations), degree=2), [0, 0], 0
-    begun = time.process_time()
     for seed in range(n):
         run = record(network, noise, seed)
         found = ep.discover(run, library.with_roles(network.roles))
         right[0] += is_right(found, network)
         negative += n_negative(found.model, network)
         right[1] += is_right(ep.discover(run, library), network)
-    cpu_s = (time.process_time() - begun) / n
     print(
         f"{name:18s} {100 * noise:3.0f} %: right with roles {right[0]}, without {right[1]} of {n}; "
-        f"{negative} of {N_STARTS * n} runs turn negative; {cpu_s:.1f} CPU-s",
+        f"{negative} of {N_STARTS * n} runs turn negative",
         flush=True,
     )
 

@@ -17,7 +17,6 @@ drawn between.
 from __future__ import annotations
 
 import sys
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import product
@@ -244,13 +243,11 @@ def grid() -> None:
 
 
 def main() -> None:
-    start = time.perf_counter()
     what = sys.argv[1] if len(sys.argv) > 1 else "family"
     if what == "grid":
         grid()
     else:
         family(int(sys.argv[2]) if len(sys.argv) > 2 else 100)
-    print(f"{time.perf_counter() - start:.0f} s")
 
 
 if __name__ == "__main__":

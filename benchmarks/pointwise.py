@@ -17,6 +17,7 @@ import pysindy
 import xarray as xr
 from threadpoolctl import threadpool_limits
 
+from benchmarks.regions import STATES, TERMS, UNITS
 from benchmarks.timing import cpu_s
 from ep2sindy.data.open import read_field
 from ep2sindy.data.trajectory import Trajectory
@@ -31,12 +32,10 @@ from ep2sindy.runtime.parallel import ONE_BY_ONE, Workers
 from ep2sindy.selection.criteria import Knee
 
 N_Z, N_R, N_SAMPLES, DT_S = 41, 49, 12001, 1.5e-6
-UNITS = {"n_i": "m^-3", "n_n": "m^-3", "u_iz": "m/s", "u_ir": "m/s", "R_ion": "m^3/s"}
 LEVELS = {"n_i": 4e17, "n_n": 3e18, "u_iz": 4e3, "u_ir": 5e2, "R_ion": 5e-14}
-TERMS = ["1", "n_n", "n_i*u_iz", "n_i*u_ir", "n_i*n_n*R_ion"]
 BLOCK_POINTS = 256
 SEARCH = PointSearch(
-    states=["n_i", "n_n"],
+    states=STATES,
     library=named_terms(list(UNITS), TERMS),
     method=Regression(
         formulation=Differential(),

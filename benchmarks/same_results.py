@@ -49,8 +49,7 @@ TOYS: dict[str, list[str]] = {
     ],
     "weak_windows": [
         "+exp=weak_windows", "fits.boxes.n_windows=[100,300]", "fits.boxes.n_points=[10,30]",
-        "noises=[0.0,0.1]",
-        "n_realizations=2", "parallel=serial",
+        "noises=[0.0,0.1]", "n_realizations=2", "parallel=serial",
     ],
     "frontier": [
         "+exp=frontier", "variants=[STLSQ,ours]", "rates_Hz=[1,20]", "durations_s=[5,40]",
@@ -144,19 +143,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("other", type=Path, help="the checkout to compare with")
     parser.add_argument("--only", nargs="*", choices=names, default=names)
-    parser.add_argument(
-        "--close", type=float, default=0.0, metavar="SHARE",
-        help="let numbers but those of models differ by this fraction of their size, or of a "
-        "column's standard deviation: what rounding makes of free runs",
-    )  # fmt: skip
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         paths = write_data(Path(folder))
-        wrong = [
-            name
-            for name in arguments.only
-            if not is_same(name, arguments.other, paths, close=arguments.close)
-        ]
+        wrong = [name for name in arguments.only if not is_same(name, arguments.other, paths)]
     sys.exit(f"they differ in {wrong}" if wrong else 0)
 
 
@@ -207,7 +197,7 @@ def _field(densities: np.ndarray, t: np.ndarray, axes: dict[str, np.ndarray]) ->
     return field
 
 
-def is_same(name: str, other: Path, paths: dict[str, Path], *, close: float) -> bool:
+def is_same(name: str, other: Path, paths: dict[str, Path]) -> bool:
     found = []
     for number, checkout in enumerate((other.resolve(), HERE)):
         output = paths["folder"] / f"{name}_{number}"
@@ -221,13 +211,7 @@ def is_same(name: str, other: Path, paths: dict[str, Path], *, close: float) -> 
     if not before:
         print(f"{name}: no files in {other} to compare with")
         return False
-    differences = [
-        text
-        for path in before
-        for text in differing(
-            before[path], now.get(path), path, close=0.0 if "models/" in path else close
-        )
-    ]
+    differences = [text for path in before for text in differing(before[path], now.get(path), path)]
     new = sorted(set(now) - set(before))
     print(
         f"{name}: {len(before)} files, "
@@ -273,37 +257,17 @@ def contents(folder: Path) -> dict[str, Any]:
     return found
 
 
-def differing(before: Any, now: Any, place: str, *, close: float = 0.0) -> Iterator[str]:
-    """Where what was there is another, or missing; what is new does not count.
-
-    close: fraction of a number's size, or of a column's standard deviation, that does not count.
-    """
+def differing(before: Any, now: Any, place: str) -> Iterator[str]:
+    """Where what was there is another, or missing; what is new does not count."""
     if isinstance(before, dict) and isinstance(now, dict):
         for key, value in before.items():
             if key.split("/")[-1] not in TIMES:
-                yield from differing(value, now.get(key), f"{place}: {key}", close=close)
+                yield from differing(value, now.get(key), f"{place}: {key}")
     elif isinstance(before, list) and isinstance(now, list) and len(before) == len(now):
-        if close and _are_close(before, now, close):
-            return
         for k, (one, other) in enumerate(zip(before, now, strict=True)):
-            yield from differing(one, other, f"{place}[{k}]", close=close)
-    elif close and _are_close([before], [now], close):
-        return
+            yield from differing(one, other, f"{place}[{k}]")
     elif before != now and not (_is_nan(before) and _is_nan(now)):
         yield f"{place}: {str(before)[:80]} became {str(now)[:80]}"
-
-
-def _are_close(before: list[Any], now: list[Any], fraction: float) -> bool:
-    """Whether all are numbers, and apart by less than part of their spread, or of their size."""
-    try:
-        one, other = (np.array(values, dtype=np.float64) for values in (before, now))
-    except (TypeError, ValueError):
-        return False
-    known = one[np.isfinite(one)]
-    spread = known.std() if known.size else 0.0
-    allowed = fraction * np.maximum(spread, np.maximum(np.abs(one), 1e-3))
-    both = np.isnan(one) & np.isnan(other)
-    return one.ndim == 1 and bool((both | (np.abs(one - other) <= allowed)).all())
 
 
 def _is_nan(value: Any) -> bool:

@@ -9,7 +9,6 @@ Prints the tables of docs/thruster.md; tests/test_thruster_reference.py holds th
 from __future__ import annotations
 
 import sys
-import time
 from collections.abc import Callable, Mapping
 from functools import cache
 from pathlib import Path
@@ -70,14 +69,16 @@ def full_run(label: str, variant: str) -> xr.Dataset:
     )  # fmt: skip
 
 
+def named_set(name: str) -> ep.thruster.Thruster:
+    """A thruster of conf/thruster."""
+    folder = Path(__file__).resolve().parents[1] / "conf" / "thruster"
+    return instantiate(OmegaConf.load(folder / f"{name}.yaml"))
+
+
 @cache
 def measured_sets() -> dict[str, tuple[ep.thruster.Thruster, float]]:
     """The default set and `thruster=lif`, each with its speed of the neutrals in m/s."""
-    path = Path(__file__).resolve().parents[1] / "conf" / "thruster" / "lif.yaml"
-    return {
-        "default": (ep.thruster.Thruster(), 338.0),
-        "lif": (instantiate(OmegaConf.load(path)), LIF_SPEED),
-    }
+    return {"default": (ep.thruster.Thruster(), 338.0), "lif": (named_set("lif"), LIF_SPEED)}
 
 
 def at_point(name: str, voltage: float, flow_mg_s: float, **how: Any) -> xr.Dataset:
@@ -111,11 +112,7 @@ def alternation_eV(label: str, *, n_steps: int = 4000) -> float:
         ep.thruster.Thruster(), POINTS[label], initial=run, averaged=False, sample_s=1.5e-8,
         duration_s=1.5e-8 * n_steps, warm_up_s=0.0, progress=False,
     )  # fmt: skip
-    return lasting_swing(steps["T_e_eV"].values.astype(float))
-
-
-def lasting_swing(T: np.ndarray) -> float:
-    """Largest half swing of a column of (steps, cells) that turns in every one of five steps."""
+    T = steps["T_e_eV"].values.astype(float)  # (steps, cells)
     windows = np.lib.stride_tricks.sliding_window_view(np.diff(T, axis=0), 5, axis=0)
     in_turn = np.all(windows[..., 1:] * windows[..., :-1] < 0.0, axis=-1)
     return float(np.max(0.5 * np.abs(windows).min(axis=-1), where=in_turn, initial=0.0))
@@ -205,9 +202,7 @@ def main() -> None:
         "measured": print_measured,
     }  # fmt: skip
     for name in sys.argv[1:] or parts:
-        began = time.process_time()
         parts[name]()
-        print(f"({time.process_time() - began:.0f} CPU-s)")
 
 
 if __name__ == "__main__":

@@ -12,7 +12,6 @@ that reach the cycle.
 """
 
 import argparse
-import time
 
 import numpy as np
 import pandas as pd
@@ -51,7 +50,6 @@ def as_measured(run: Trajectory, seed: int) -> Trajectory:
 
 
 def row(clean: Trajectory, measured: Trajectory, seed: int) -> dict[str, object]:
-    begin = time.process_time()
     signal = prepare_signal(measured)
     n = round(0.75 * measured.n_samples)
     chosen = ep.embed(signal.window(0, n))
@@ -61,7 +59,6 @@ def row(clean: Trajectory, measured: Trajectory, seed: int) -> dict[str, object]
     search = BestSubset(max_terms=5, n_best=8)
     method = Regression(search=search, selection=rule, bootstraps=Bootstraps(n=0), depth=8)
     model = discover(chosen.run, chosen.library(degree=3), method).model
-    seconds = time.process_time() - begin
     record = np.column_stack([clean.states[:, 0], states.states[:, 1]])
     held = Trajectory(states.t, record, states.state_names).window(n, states.n_samples)
     run = evaluate(model, held, initial=states.states[n], assessed=(NAME,))
@@ -72,7 +69,6 @@ def row(clean: Trajectory, measured: Trajectory, seed: int) -> dict[str, object]
         "waveform": run.waveform_error[NAME],
         "terms": len(model.terms("g")),
         "reaching": run.basin_stability,
-        "CPU s": seconds,
         "g'": ", ".join(model.terms("g")),
     }
 
@@ -87,9 +83,8 @@ def main() -> None:
         clean = current(point)
         for seed in range(arguments.seeds):
             for record, run in {"clean": clean, "scope": as_measured(clean, seed)}.items():
-                found = {"point": point, "record": record, "seed": seed} | row(clean, run, seed)
-                rows.append(found)
-                print(found, flush=True)
+                labels = {"point": point, "record": record, "seed": seed}
+                rows.append(labels | row(clean, run, seed))
     print(pd.DataFrame(rows).to_string(index=False, float_format=lambda x: f"{x:.3g}"))
 
 

@@ -20,9 +20,8 @@ from benchmarks.hallthruster import (
     line_Hz,
     n_i_over_theirs,
     net_thrust,
-    spt100_run,
     stored,
-    tutorial,
+    tutorial_run,
 )
 
 pytestmark = pytest.mark.slow
@@ -33,7 +32,7 @@ needs_table = pytest.mark.skipif(
 
 
 def test_spt100_tutorial_has_their_current_thrust_and_profiles():
-    run = spt100_run(tutorial(), 100)
+    run = tutorial_run()
     off = deviations(late(run).mean("time"), stored("hallthruster_spt100.csv"))
     assert float(late(run)["I_d"].mean()) == pytest.approx(TUTORIAL["I_d"], rel=0.02)
     assert float(late(run)["I_d"].std()) < 0.25

@@ -16,7 +16,7 @@ def rates(*energy_eV: float) -> TabulatedRates:
 
 
 def test_the_wall_is_the_benchmarks_formula():
-    wall = ExponentialWall(0.5)
+    wall = ExponentialWall((0.5, 1.0))
     np.testing.assert_allclose(wall.power(T, 0.0, M_XENON), 1.5e7 * T * np.exp(-20.0 / (1.5 * T)))
     np.testing.assert_array_equal(wall.power_weight(DISTANCE), [0.5, 0.5, 1.0, 1.0, 1.0])
     np.testing.assert_array_equal(wall.collision_weight(DISTANCE), [1.0, 1.0, 0.0, 0.0, 0.0])
