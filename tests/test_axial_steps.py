@@ -15,6 +15,7 @@ from ep2sindy.thruster.axial.settings import to_json
 from ep2sindy.thruster.axial.simulate import first_fields
 from ep2sindy.thruster.axial.starts import GuessedStart
 from ep2sindy.thruster.constants import E_CHARGE, M_ELECTRON
+from tests.thrusters import at, slope_at
 
 POINT = ep.thruster.OperatingPoint(300.0, 5.0)
 N_CELLS = 41
@@ -51,6 +52,12 @@ def moving(request):
         heavy.heavy_step(state, model, DT_S, sums, work)
         assert electron_step(state, model, DT_S, work)
     return model, state, sums, work
+
+
+def test_loops_go_over_cells_and_faces_and_stay_within_the_arrays():
+    ghosts = np.zeros(5)
+    assert list(kept.inside.py_func(ghosts)) == [1, 2, 3]
+    assert list(kept.faces.py_func(ghosts)) == [0, 1, 2, 3]
 
 
 def agree(found, expected, tolerance=1e-12):
@@ -157,15 +164,6 @@ def test_a_heavy_step_is_heuns_step_of_the_scheme(moving):
         agree(sums.cells[place, INNER], expected if name == "faces" else expected[INNER])
 
 
-def at(table, column, T):
-    return np.interp(T, closures.TABLE_STEP_EV * np.arange(len(table)), table[:, column])
-
-
-def rising(table, column, T):
-    row = (T / closures.TABLE_STEP_EV).astype(int)
-    return np.maximum(table[row + 1, column] - table[row, column], 0.0) / closures.TABLE_STEP_EV
-
-
 def plain_collisions(T, hot, n, log_n, state, model):
     """Frequencies in 1/s, and losses in eV/(m^3 s) with their slopes in T_e."""
     table, nn = model.table, state.n_n
@@ -175,9 +173,11 @@ def plain_collisions(T, hot, n, log_n, state, model):
     with_neutrals = at(table, closures.MOMENTUM, T) + at(table, closures.EVENTS, hot)
     nu = nn * with_neutrals + coulomb + model.anomalous + on_wall
     wall = n * model.wall_power_weight * at(table, closures.WALL_POWER, T)
-    wall_slope = n * model.wall_power_weight * rising(table, closures.WALL_POWER, T)
+    wall_slope = (
+        n * model.wall_power_weight * np.maximum(slope_at(table, closures.WALL_POWER, T), 0.0)
+    )
     inelastic = n * nn * at(table, closures.INELASTIC, hot)
-    inelastic_slope = n * nn * rising(table, closures.INELASTIC, hot)
+    inelastic_slope = n * nn * np.maximum(slope_at(table, closures.INELASTIC, hot), 0.0)
     if model.drift_credit:
         inelastic -= n * nn * at(table, closures.DRIFT_EVENTS, hot) * state.drift_eV
     for k, ((below, _), cost) in enumerate(zip(model.further, model.further_eV, strict=True)):
