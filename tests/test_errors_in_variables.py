@@ -245,6 +245,20 @@ def test_noise_bends_the_mean_of_functions_unless_a_step_leaves_their_domain() -
     np.testing.assert_allclose(lift, expected, rtol=1e-12, atol=1e-15)
 
 
+def test_the_lift_by_noise_is_taken_from_terms_at_noisy_samples() -> None:
+    (run,), library = noisy_runs(lotka_volterra(), 0.05), named_terms(["x", "y"], ["x", "sin(2*x)"])
+    problem = EVERY_ROW.assemble([run], library, rng=np.random.default_rng(0))[0]
+    sums, x = whitening._Sums.of(problem, np.ones(2, dtype=bool)), problem.noisy.columns[0]
+    raw, smooth = (
+        whitening._Linearised.at(problem, sums, x, np.ones(2), noisy=noisy)
+        for noisy in (True, False)
+    )
+    lift = problem.noisy.windows.mean @ (whitening._lift(problem, x.T) / problem.theta_scale)
+    assert np.abs(lift[:, 1]).max() > 1e-5
+    expected = smooth.theta - whitening._solve(raw.factor, lift)
+    np.testing.assert_allclose(raw.theta, expected, rtol=1e-9, atol=1e-12)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["lotka_volterra", "lorenz"])
 def test_intervals_of_95_percent_hold_the_truth_in_90_to_98_of_100(name: str) -> None:

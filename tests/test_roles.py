@@ -202,6 +202,7 @@ def test_what_is_stated_is_kept_next_to_what_is_found(record):
         (lambda: ep.Roles(inflow={"x": "some"}), "must be a number in SI per second, a list"),
         (lambda: ep.Roles(outflow={"x": {"x": "fast"}}), "terms with their coefficients in SI"),
         (lambda: ep.Roles(sizes={"x": 0.0}), "sizes must be positive numbers: x has 0.0"),
+        (lambda: ep.Roles(sizes={"x": np.inf}), "sizes must be positive numbers: x has inf"),
         (
             lambda: ep.Roles(inflow={"n_n": "known"}).processes(LIBRARY, STATES),
             "known only where a record gives them",
