@@ -11,6 +11,7 @@ import ep2sindy as ep
 from ep2sindy.library.relations import binding, complete, parse_relation
 from ep2sindy.model.stability import limit_cycle
 from ep2sindy.model.vector_field import VectorField
+from ep2sindy.selection import free_run
 from ep2sindy.selection.free_run import CycleRuns
 from ep2sindy.selection.systems import (
     ConfirmedSystem,
@@ -154,6 +155,17 @@ def test_runs_start_at_phases_spread_over_the_period(rounds, part, n_samples, st
         assert f_error < 1e-4
         assert amplitude == pytest.approx(0.05, abs=1e-4)
         assert error == amplitude / runs.bounds.amplitude > waveform / runs.bounds.waveform
+
+
+def test_the_longest_record_confirms_a_system(rounds, monkeypatch):
+    runs, seen = rounds[0], []
+    both = [runs.runs[0].window(0, 400), runs.runs[0]]
+    verdict = SimpleNamespace(status=ep.model.Status.WRONG_CYCLE)
+    monkeypatch.setattr(free_run, "evaluate", lambda _, run, **__: seen.append(run) or verdict)
+    tried = Trial(SimpleNamespace(broken=lambda model: []))
+    for order in (both, both[::-1]):
+        replace(runs, runs=order, cycles=[*runs.cycles] * 2).confirm(tried, None)
+    assert [run.n_samples for run in seen] == [960, 960]
 
 
 def test_noise_that_more_terms_follow_does_not_make_a_cycle_attract():
