@@ -168,6 +168,13 @@ def test_the_longest_record_confirms_a_system(rounds, monkeypatch):
     assert [run.n_samples for run in seen] == [960, 960]
 
 
+def test_a_verdict_says_how_many_starts_reach_the_cycle():
+    run = SimpleNamespace(text="sustained", status=ep.model.Status.SUSTAINED)
+    tried, model = Trial(None), SimpleNamespace(inputs=())
+    expected = "sustained, 25 % of starts reach it; 2 of 9 systems are sustained where not fitted"
+    assert ConfirmedSystem(tried, model, (), 0.25, run).text(2, 9) == expected
+
+
 def test_noise_that_more_terms_follow_does_not_make_a_cycle_attract():
     how = recipe(max_terms=3, n_best=1, formulation=ep.WeightedWeak())
     found = ep.discover(
@@ -236,6 +243,8 @@ def test_folds_share_no_sample_and_leave_none_out():
     assert fitted == [[(2, 8)], [], [(0, 5)]]
     with pytest.raises(ValueError, match="runs must hold 30 samples to be parted in 3"):
         folds([run.window(0, 20)], 3)
+    with pytest.raises(ValueError, match="got at most 20"):
+        folds([run.window(0, 10), run.window(0, 20)], 3)
 
 
 SHARED = "x: x*y == -1 * y: x*y"

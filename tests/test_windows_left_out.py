@@ -276,9 +276,15 @@ def test_a_window_leaves_room_for_another(
     monkeypatch.setattr(by_windows, "dominant_window", lambda runs, states: 40)
     runs = pieces_of(*lengths)
     assert WindowsLeftOut(runs, np.ones(2), ["x", "y"], 20, 3).window == window
-    short = WindowsLeftOut([run.window(0, 7 + k % 3) for k, run in enumerate(runs)], *[None] * 4)
-    with pytest.raises(ValueError, match="of 5 samples or more, got at most [789]; use longer"):
+    short = WindowsLeftOut([runs[0].window(0, 9), runs[0].window(0, 8)], *[None] * 4)
+    with pytest.raises(ValueError, match="of 5 samples or more, got at most 9; use longer records"):
         _ = short.window
+
+
+def test_a_window_is_no_longer_than_the_longest_segment() -> None:
+    parts = [systems.Segment(0, 0, 60), systems.Segment(1, 20, 100)]
+    cut = systems.cut_segments(pieces_of(60, 100), parts, PREY.model, window=500, n_windows=2)
+    assert cut.data.shape[1] == 80
 
 
 def test_pairs_of_windows_are_spread_over_every_record_by_its_length() -> None:
