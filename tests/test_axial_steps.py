@@ -15,6 +15,7 @@ from ep2sindy.thruster.axial.settings import to_json
 from ep2sindy.thruster.axial.simulate import first_fields
 from ep2sindy.thruster.axial.starts import GuessedStart
 from ep2sindy.thruster.constants import E_CHARGE, M_ELECTRON
+from tests.thrusters import at, slope_at
 
 POINT = ep.thruster.OperatingPoint(300.0, 5.0)
 N_CELLS = 41
@@ -51,6 +52,12 @@ def moving(request):
         heavy.heavy_step(state, model, DT_S, sums, work)
         assert electron_step(state, model, DT_S, work)
     return model, state, sums, work
+
+
+def test_loops_go_over_cells_and_faces_and_stay_within_the_arrays():
+    ghosts = np.zeros(5)
+    assert list(kept.inside.py_func(ghosts)) == [1, 2, 3]
+    assert list(kept.faces.py_func(ghosts)) == [0, 1, 2, 3]
 
 
 def agree(found, expected, tolerance=1e-12):
@@ -104,7 +111,7 @@ def rates_of(n, g, nn, state, model):
             d_g[below - 1] -= momentum_gain
         else:
             consumed += born
-    before, behind, at_anode, faces, walls = model.per_before, model.per_behind, 0.0, [], []
+    before, behind, faces, walls = model.per_before, model.per_behind, [], []
     for z in charges:
         k, lost = z - 1, np.sqrt(z) * state.wall_loss
         flux, momentum = through_faces(n[k], g[k], z, model)
@@ -116,14 +123,18 @@ def rates_of(n, g, nn, state, model):
         d_g[k, INNER] += momentum[:-1] * before[INNER] - momentum[1:] * behind[INNER]
         d_g[k, INNER] += (momentum_gain - lost * g[k])[INNER]
         d_nn += lost * n[k]
-        at_anode += flux[0]
         faces.append(flux)
         walls.append(lost * n[k])
     flux = model.neutral_speed * (nn + slopes(nn, model))[:-1]
-    flux[0] = model.neutral_inflow - at_anode
+    flux[0] = model.neutral_inflow - sum(each[0] for each in faces)
     d_nn[INNER] += flux[:-1] * model.neutral_before[INNER] - flux[1:] * model.neutral_behind[INNER]
     d_nn -= consumed
-    return (d_n, d_g, d_nn), {"faces": faces[0][:-1], "walls": sum(walls), "ionized": consumed}
+    cells = {kept.FACE_I + kept.PER_CHARGE * k: each[:-1] for k, each in enumerate(faces)}
+    cells |= {kept.FACE_N: flux[:-1], kept.WALL_LOSS: sum(walls)[INNER]}
+    out = model.spread_at[-1] * np.array([each[-1] for each in faces])
+    series = {kept.BEAM: np.dot(charges, out), kept.IONS_OUT: out.sum()}
+    series |= {kept.NEUTRALS_OUT: model.spread_at[-1] * flux[-1]}
+    return (d_n, d_g, d_nn), cells | {kept.IONIZATION: consumed[INNER]}, series
 
 
 def held(n, g):
@@ -137,13 +148,13 @@ def held(n, g):
 
 def test_a_heavy_step_is_heuns_step_of_the_scheme(moving):
     model, state, sums, work = moving
-    sums.cells[:] = 0.0
+    sums.cells[:] = sums.series[:] = 0.0
     for each in (state.n_i, state.flux_i, state.rates):
         each[1:, 5:15] *= 1e-20  # higher charges, too rare to move by themselves
     n, g, nn = state.n_i.copy(), state.flux_i.copy(), state.n_n.copy()
-    (d_n, d_g, d_nn), one = rates_of(n, g, nn, state, model)
+    (d_n, d_g, d_nn), cells, series = rates_of(n, g, nn, state, model)
     new_n, new_g = held(n + DT_S * d_n, g + DT_S * d_g)
-    (e_n, e_g, e_nn), two = rates_of(new_n, new_g, nn + DT_S * d_nn, state, model)
+    (e_n, e_g, e_nn), cells_2, series_2 = rates_of(new_n, new_g, nn + DT_S * d_nn, state, model)
     new_n, new_g = held(0.5 * (n + new_n + DT_S * e_n), 0.5 * (g + new_g + DT_S * e_g))
     heavy.heavy_step(state, model, DT_S, sums, work)
     for k in range(len(n)):
@@ -151,19 +162,11 @@ def test_a_heavy_step_is_heuns_step_of_the_scheme(moving):
         agree(state.flux_i[k, INNER], new_g[k, INNER])
         agree(work.u[k, INNER], (new_g / new_n)[k, INNER])
     agree(state.n_n[INNER], (nn + 0.5 * DT_S * (d_nn + e_nn))[INNER])
-    places = {"faces": kept.FACE_I, "walls": kept.WALL_LOSS, "ionized": kept.IONIZATION}
-    for name, place in places.items():
-        expected = 0.5 * DT_S * (one[name] + two[name])
-        agree(sums.cells[place, INNER], expected if name == "faces" else expected[INNER])
-
-
-def at(table, column, T):
-    return np.interp(T, closures.TABLE_STEP_EV * np.arange(len(table)), table[:, column])
-
-
-def rising(table, column, T):
-    row = (T / closures.TABLE_STEP_EV).astype(int)
-    return np.maximum(table[row + 1, column] - table[row, column], 0.0) / closures.TABLE_STEP_EV
+    for place, rate in cells.items():
+        agree(sums.cells[place, INNER], 0.5 * DT_S * (rate + cells_2[place]))
+    for place, rate in series.items():
+        expected = 0.5 * DT_S * (rate + series_2[place])
+        assert sums.series[place] == pytest.approx(expected, rel=1e-12)
 
 
 def plain_collisions(T, hot, n, log_n, state, model):
@@ -175,9 +178,11 @@ def plain_collisions(T, hot, n, log_n, state, model):
     with_neutrals = at(table, closures.MOMENTUM, T) + at(table, closures.EVENTS, hot)
     nu = nn * with_neutrals + coulomb + model.anomalous + on_wall
     wall = n * model.wall_power_weight * at(table, closures.WALL_POWER, T)
-    wall_slope = n * model.wall_power_weight * rising(table, closures.WALL_POWER, T)
+    wall_slope = (
+        n * model.wall_power_weight * np.maximum(slope_at(table, closures.WALL_POWER, T), 0.0)
+    )
     inelastic = n * nn * at(table, closures.INELASTIC, hot)
-    inelastic_slope = n * nn * rising(table, closures.INELASTIC, hot)
+    inelastic_slope = n * nn * np.maximum(slope_at(table, closures.INELASTIC, hot), 0.0)
     if model.drift_credit:
         inelastic -= n * nn * at(table, closures.DRIFT_EVENTS, hot) * state.drift_eV
     for k, ((below, _), cost) in enumerate(zip(model.further, model.further_eV, strict=True)):
@@ -187,7 +192,10 @@ def plain_collisions(T, hot, n, log_n, state, model):
 
 
 def plain_temperature(T, n, flux, kappa, losses, heating, state, model):
-    """The implicit step of the electrons' heat, by a dense solver. flux: n u_e through faces."""
+    """The implicit step of the electrons' heat, and its flux at both ends, by a dense solver.
+
+    flux: n u_e through faces.
+    """
     conducting = 0.5 * (kappa[1:] + kappa[:-1]) * model.per_between
     flux = 2.5 * flux
     power_law = np.maximum(1.0 - 0.1 * model.slope_weight * np.abs(flux) / conducting, 0.0) ** 5
@@ -202,7 +210,8 @@ def plain_temperature(T, n, flux, kappa, losses, heating, state, model):
     sources = DT_S * (heating - inelastic - wall)[INNER]
     known[INNER] = state.energy[INNER] + slope * T[INNER] + sources
     scale = np.abs(matrix).max(axis=1)
-    return np.linalg.solve(matrix / scale[:, None], known / scale)
+    new = np.linalg.solve(matrix / scale[:, None], known / scale)
+    return new, (down * new[:-1] + up * new[1:])[[0, -1]]
 
 
 def test_an_electron_step_is_that_of_the_scheme(moving):
@@ -232,7 +241,7 @@ def test_an_electron_step_is_that_of_the_scheme(moving):
     drift = 0.5 * (backwards / n) ** 2 / (mobility * nu) * (model.drift_weight > 0.0)
     through = 0.5 * (g[1:] + g[:-1]) - total / model.spread_at
     losses = inelastic, wall
-    new = plain_temperature(T, n, through, kappa, losses, backwards * E, state, model)
+    new, ends = plain_temperature(T, n, through, kappa, losses, backwards * E, state, model)
 
     assert electron_step(state, model, DT_S, work)
     for found, expected in (
@@ -243,7 +252,13 @@ def test_an_electron_step_is_that_of_the_scheme(moving):
     assert state.instant[kept.CURRENT] == pytest.approx(current, rel=1e-12)
     watts = E_CHARGE * model.area
     paid = [loss + slope * (new - T) for loss, slope in losses]
+    z, out, exit_kg = z[:, None], state.flux_i[:, -2], model.ion_mass * model.spread_at[-1]
+    on_walls = z**1.5 * state.n_i * at(model.table, closures.ION_LOSS, T) * model.wall_ion_weight
     powers = {
+        kept.THRUST: model.area * exit_kg * (out**2 / state.n_i[:, -2]).sum(),
+        kept.WALL_CURRENT: watts * (volume * on_walls)[:, INNER].sum(),
+        kept.P_ANODE: -watts * ends[0],
+        kept.P_CATHODE: watts * model.spread_at[-1] * ends[1],
         kept.POWER: current * (model.dz * E)[INNER].sum(),
         kept.P_IONS: watts * (volume * g * E)[INNER].sum(),
         kept.P_INELASTIC: watts * (volume * paid[0])[INNER].sum(),

@@ -1,3 +1,5 @@
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -5,6 +7,7 @@ from benchmarks.intervals import held
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.choice import reweight
 from ep2sindy.library.library import named_terms, polynomial
+from ep2sindy.regression import whitening
 from ep2sindy.regression.bootstraps import Bootstraps, pool_supports
 from ep2sindy.regression.formulations import RandomSplit, Weak, WeightedWeak
 from ep2sindy.regression.front import Candidate, fit_support, pareto_front
@@ -168,6 +171,92 @@ def test_an_input_may_be_noisy_too() -> None:
     error = np.abs(candidate.coef - [-1.0, 1.0]) / np.sqrt(np.diag(candidate.covariance))
     assert error.max() < 3.5
     assert np.sqrt(np.diag(candidate.covariance)).max() < 0.05
+
+
+@pytest.mark.parametrize(
+    ("lowest", "limit", "n_tried", "cost"),
+    [(5.0, 0.0, 4, 0.0), (0.0, 8.9, 1 + whitening.MAX_HALVED, None), (0.0, 9.0, 1, 9.0)],
+)
+def test_a_step_is_halved_until_the_cost_falls(
+    monkeypatch: pytest.MonkeyPatch, lowest: float, limit: float, n_tried: int, cost: float | None
+) -> None:
+    tried = []
+
+    def at(problem: object, sums: object, x: np.ndarray, coef: np.ndarray) -> SimpleNamespace:
+        tried.append((x.item(), coef.item()))
+        return SimpleNamespace(cost=9.0 if x.item() > lowest else 0.0)
+
+    monkeypatch.setattr(whitening._Linearised, "at", at)
+    x, coef = np.full((1, 1), 3.0), np.array([5.0])
+    rows = SimpleNamespace(x=x, coef=coef, cost=9.0, correct=lambda coef: x + 16.0)
+    problem = SimpleNamespace(library=polynomial(["x"]))
+    step = whitening._step(problem, None, rows, coef + 32.0, limit=limit)
+    assert (step and step.cost) == cost
+    assert tried == [(3.0 + 16.0 * 0.5**k, 5.0 + 32.0 * 0.5**k) for k in range(n_tried)]
+
+
+def test_every_step_may_raise_the_least_cost_so_far_by_ten_per_row(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    system, costs, limits, step = lorenz(), [], [], whitening._step
+
+    def seen(problem, sums, rows, coef, *, limit):
+        costs.append(rows.cost)
+        limits.append(limit - 10.0 * len(rows.target))
+        return step(problem, sums, rows, coef, limit=limit)
+
+    monkeypatch.setattr(whitening, "_step", seen)
+    problem = problems_of(system, noisy_runs(system, 0.1))[1]
+    coef = system.model.coef[:, 1] / problem.coef_scale(0)
+    whiten_rows(problem, coef != 0.0, coef, n_steps=3)
+    assert len(costs) == 3
+    assert limits == pytest.approx([min(costs[: k + 1]) for k in range(3)], rel=1e-12)
+    assert [whitening._is_near(coef, 1.01 * coef, by) for by in (0.0, 0.009, 0.011)] == [0, 0, 1]
+    assert not whitening._is_near(coef, coef, 0.0)
+
+
+def test_corrected_samples_obey_a_linear_model_exactly() -> None:
+    t = np.arange(400) * 0.02
+    states = np.stack([np.sin(3 * t), 3 * np.cos(3 * t)], axis=1)
+    states += np.random.default_rng(0).standard_normal(states.shape) * [0.02, 0.06]
+    run = Trajectory(t=t, states=states, state_names=["x", "v"])
+    library = named_terms(["x", "v"], ["x", "v"])
+    problem = EVERY_ROW.assemble([run], library, rng=np.random.default_rng(0))[1]
+    coef = np.array([-1.0, 0.0])
+    corrected = whiten_rows(problem, np.ones(2, dtype=bool), coef, n_steps=1).corrected
+    windows, left = problem.noisy.windows, []
+    for samples in (corrected, states):
+        theta, target = windows.mean @ samples, windows.slope @ samples[:, 1]
+        residual = target - theta @ np.linalg.lstsq(theta, target)[0]
+        left.append(np.linalg.norm(residual) / np.linalg.norm(target))
+    assert left[0] < 1e-4 < 1e-2 < left[1]  # RIDGE of the variance stays
+
+
+def test_noise_bends_the_mean_of_functions_unless_a_step_leaves_their_domain() -> None:
+    library = named_terms(["x", "v"], ["sin(x)", "x*v", "sqrt(v)", "sqrt(1-v)"])
+    x = np.array([[0.3, 0.5], [1.2, 0.95], [2.0, 0.05]])  # v + s and v - s leave [0, 1]
+    noise = {"values": np.empty((3, 2)), "noise_std": np.full((3, 2), [0.2, 0.1])}
+    noisy = SimpleNamespace(windows=range(3), **noise)  # a row for two values: half is left
+    lift = whitening._lift(SimpleNamespace(library=library, noisy=noisy), x)
+    s, v = np.array([0.2, 0.1]) / np.sqrt(2.0), 0.5
+    expected = np.zeros((3, 4))
+    expected[:, 0] = np.sin(x[:, 0]) * (np.cos(s[0]) - 1.0)
+    expected[0, 2:] = 0.5 * (np.sqrt(v + s[1]) + np.sqrt(v - s[1])) - np.sqrt(v)
+    np.testing.assert_allclose(lift, expected, rtol=1e-12, atol=1e-15)
+
+
+def test_the_lift_by_noise_is_taken_from_terms_at_noisy_samples() -> None:
+    (run,), library = noisy_runs(lotka_volterra(), 0.05), named_terms(["x", "y"], ["x", "sin(2*x)"])
+    problem = EVERY_ROW.assemble([run], library, rng=np.random.default_rng(0))[0]
+    sums, x = whitening._Sums.of(problem, np.ones(2, dtype=bool)), problem.noisy.columns[0]
+    raw, smooth = (
+        whitening._Linearised.at(problem, sums, x, np.ones(2), noisy=noisy)
+        for noisy in (True, False)
+    )
+    lift = problem.noisy.windows.mean @ (whitening._lift(problem, x.T) / problem.theta_scale)
+    assert np.abs(lift[:, 1]).max() > 1e-5
+    expected = smooth.theta - whitening._solve(raw.factor, lift)
+    np.testing.assert_allclose(raw.theta, expected, rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.slow

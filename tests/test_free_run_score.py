@@ -10,7 +10,19 @@ import pytest
 import ep2sindy as ep
 from ep2sindy.library.relations import binding, complete, parse_relation
 from ep2sindy.model.stability import limit_cycle
-from ep2sindy.selection.systems import ConfirmedSystem, Trial, find_sustained, folds, list_others
+from ep2sindy.model.vector_field import VectorField
+from ep2sindy.selection import free_run
+from ep2sindy.selection.free_run import CycleRuns
+from ep2sindy.selection.systems import (
+    ConfirmedSystem,
+    Segment,
+    Trial,
+    find_sustained,
+    folds,
+    list_others,
+    order_equals,
+)
+from ep2sindy.signals.attractor import Cycle
 from tests.models import model_of
 
 PREY = replace(ep.lotka_volterra(), rate_Hz=5.0)  # 69 samples a period
@@ -102,6 +114,67 @@ def test_starts_at_other_phases_refuse_what_is_sustained_from_one(found):
         assert (several.scores[state] >= found.scores[state] - 1e-9).all()
 
 
+def circle(phase):
+    return np.stack([np.cos(phase), -np.sin(phase)], axis=1)
+
+
+@pytest.fixture(params=[(), ("u",)], ids=["free", "driven"])
+def rounds(request):
+    """24 rounds on a circle, 40 samples each, as a record and by its equations."""
+    t, rule = 0.025 * np.arange(960), ep.FreeRunScore(n_starts=4)
+    phase, turns = 2 * np.pi * t, {"x": {"y": 2 * np.pi}, "y": {"x": -2 * np.pi}}
+    inputs = np.ones((960, len(request.param)))
+    run = ep.Trajectory(t, circle(phase), ["x", "y"], inputs, request.param)
+    cycle = Cycle(1.0, phase, np.zeros(2), np.array([[1.0, 1.0j]]), 1.0)
+    model = model_of(turns, request.param)
+    field = VectorField.of(model.library, ["x", "y", *request.param], model.coef[None])
+    return CycleRuns(rule, [run], [], [run.states], [cycle], rule.bounds), field
+
+
+@pytest.mark.parametrize(
+    ("part", "n_samples", "starts"),
+    [
+        # A run lasts 16 periods at least; starts beyond a short part are its last sample.
+        ((480, 960), {"free": 640, "driven": 960}, {"free": [480, 530, 580, 630], "driven": [0]}),
+        ((240, 960), {"free": 720, "driven": 720}, {"free": [240, 290, 340, 390], "driven": [240]}),
+        ((880, 940), {"free": 640, "driven": 960}, {"free": [880, 930, 939, 939], "driven": [0]}),
+    ],
+)
+def test_runs_start_at_phases_spread_over_the_period(rounds, part, n_samples, starts):
+    runs, field = rounds
+    kind = "driven" if runs.runs[0].input_names else "free"
+    found = list(runs._run(field, [Segment(0, *part)]))
+    assert len(found) == len(starts[kind])
+    for (t, paths, cycle), start in zip(found, starts[kind], strict=True):
+        assert len(t) == n_samples[kind]
+        phase = 2 * np.pi * (t - t[0] + 0.025 * start)
+        # Two Runge-Kutta steps per sample, each with an error of (2 pi/80)^5/120.
+        limit = 2 * len(t) * (np.pi / 40) ** 5 / 120
+        np.testing.assert_allclose(paths[0], circle(phase), rtol=0, atol=limit)
+        error, f_error, amplitude, waveform = runs._compare(t, 0.95 * paths, cycle, ["x", "y"])[0]
+        assert f_error < 1e-4
+        assert amplitude == pytest.approx(0.05, abs=1e-4)
+        assert error == amplitude / runs.bounds.amplitude > waveform / runs.bounds.waveform
+
+
+def test_the_longest_record_confirms_a_system(rounds, monkeypatch):
+    runs, seen = rounds[0], []
+    both = [runs.runs[0].window(0, 400), runs.runs[0]]
+    verdict = SimpleNamespace(status=ep.model.Status.WRONG_CYCLE)
+    monkeypatch.setattr(free_run, "evaluate", lambda _, run, **__: seen.append(run) or verdict)
+    tried = Trial(SimpleNamespace(broken=lambda model: []))
+    for order in (both, both[::-1]):
+        replace(runs, runs=order, cycles=[*runs.cycles] * 2).confirm(tried, None)
+    assert [run.n_samples for run in seen] == [960, 960]
+
+
+def test_a_verdict_says_how_many_starts_reach_the_cycle():
+    run = SimpleNamespace(text="sustained", status=ep.model.Status.SUSTAINED)
+    tried, model = Trial(None), SimpleNamespace(inputs=())
+    expected = "sustained, 25 % of starts reach it; 2 of 9 systems are sustained where not fitted"
+    assert ConfirmedSystem(tried, model, (), 0.25, run).text(2, 9) == expected
+
+
 def test_noise_that_more_terms_follow_does_not_make_a_cycle_attract():
     how = recipe(max_terms=3, n_best=1, formulation=ep.WeightedWeak())
     found = ep.discover(
@@ -164,8 +237,14 @@ def test_folds_share_no_sample_and_leave_none_out():
             assert len(held) + len(kept) == len(runs) * run.n_samples
             seen += list(held)
         assert sorted(seen) == [(j, k) for j in range(len(runs)) for k in range(run.n_samples)]
+    assert [fold.held for fold in folds([run] * 3, 3)] == [[Segment(k, 0, 216)] for k in range(3)]
+    short = folds([run.window(0, 30), run.window(0, 8)], 3)  # pieces of 5 samples are fitted
+    fitted = [[(part.start, part.stop) for part in fold.fitted if part.run == 1] for fold in short]
+    assert fitted == [[(2, 8)], [], [(0, 5)]]
     with pytest.raises(ValueError, match="runs must hold 30 samples to be parted in 3"):
         folds([run.window(0, 20)], 3)
+    with pytest.raises(ValueError, match="got at most 20"):
+        folds([run.window(0, 10), run.window(0, 20)], 3)
 
 
 SHARED = "x: x*y == -1 * y: x*y"
@@ -249,24 +328,38 @@ def test_what_attracts_most_starts_is_preferred(others, best):
 
 
 def test_what_attracts_outdoes_a_neutral_cycle_as_an_equal_or_by_its_fit():
-    resting = confirmed(fraction=0.0)
-    assert confirmed(fraction=1.0, waveform=0.07, loss=2.0).outdoes(resting)
-    assert not confirmed(fraction=1.0, waveform=0.08, loss=2.0).outdoes(resting)
-    assert not confirmed(fraction=1.0, n_free=5, loss=0.96).outdoes(resting)
-    assert confirmed(fraction=1.0, n_free=5, loss=0.94).outdoes(resting)
+    resting = confirmed(fraction=0.0, loss=2.0)
+    assert confirmed(fraction=1.0, waveform=0.07, loss=4.0).outdoes(resting)
+    assert not confirmed(fraction=1.0, waveform=0.08, loss=4.0).outdoes(resting)
+    assert not confirmed(fraction=1.0, n_free=5, loss=1.92).outdoes(resting)
+    assert confirmed(fraction=1.0, n_free=5, loss=1.88).outdoes(resting)
 
 
-def trial(name, *, n_free=4, error=0.3, waveform=0.05, loss=1.0):
+def trial(name, *, n_free=4, error=0.3, waveform=0.05, loss=1.0, order=0):
     """The trial of a system whose only term is its name."""
-    held = SimpleNamespace(n_free=n_free, parts={"x'": (name,)})
+    held = SimpleNamespace(n_free=n_free, parts={"x'": (name,)}, order=order)
     return Trial(held, error, 0.0, 0.0, waveform, loss)
+
+
+def test_what_has_room_comes_first_then_the_smallest_then_the_closest() -> None:
+    ranked = [
+        trial("closest", error=0.6), trial("close", waveform=0.06),
+        trial("larger", n_free=5, waveform=0.01), trial("at the bound", error=0.7, n_free=3),
+    ]  # fmt: skip
+    assert sorted([*reversed(ranked)], key=lambda t: t.rank(0.6)) == ranked
+
+
+def test_of_systems_as_good_as_the_best_left_the_lowest_order_comes_first() -> None:
+    best, simple = trial("a", order=3), trial("b", waveform=0.054, order=2)
+    worse, larger = trial("c", waveform=0.056, order=1), trial("d", n_free=5)
+    assert order_equals([best, simple, worse, larger]) == [simple, best, worse, larger]
 
 
 @pytest.mark.parametrize(("least", "names"), [(1e-2, ["c", "b", "e"]), (1e-9, ["e"])])
 def test_where_the_truth_is_in_the_library_no_other_counts_as_equal(least, names):
     trials = [
-        trial("a", loss=least), trial("b"), trial("c", waveform=0.04), trial("d", n_free=5),
-        trial("e", loss=least, waveform=0.06), trial("f", error=1.1),
+        trial("a", loss=least), trial("b", error=1.0), trial("c", waveform=0.04),
+        trial("d", n_free=5), trial("e", loss=least, waveform=0.06), trial("f", error=1.1),
     ]  # fmt: skip
     found = list_others(find_sustained(trials), trials[0])
     assert [other.terms["x'"] for other in found] == [(name,) for name in names]

@@ -19,7 +19,7 @@ from ep2sindy.operating.left_out import (
 )
 from ep2sindy.operating.point_fits import PointFits, fit_rows, fit_trajectories
 from ep2sindy.operating.records import OperatingRecord, branches_of
-from ep2sindy.regression.pooled import fewest_of_least
+from ep2sindy.regression.pooled import Basis, fewest_of_least, invert_covariance
 from ep2sindy.regression.rows import RegressionRows
 from tests.models import plain_rows
 
@@ -278,6 +278,27 @@ def test_of_errors_that_cannot_be_stated_apart_the_fewest_numbers_are_chosen() -
     assert fewest_of_least([(least, 12), (same, 6), (worse, 3)]) == 1
     assert fewest_of_least([(least, 6), (least, 6)]) == 0
     assert fewest_of_least([(worse, 3)]) == 0
+    assert fewest_of_least([(least[:1], 3), (least[:1] + 0.1, 2)]) == 0  # one point has no spread
+
+
+def test_a_point_is_predicted_by_the_fit_to_all_others() -> None:
+    rng = np.random.default_rng(2)
+    theta, values = rng.normal(size=(7, 3)) * [1.0, 1e9, 1e-9], rng.normal(size=(7, 2))
+    predicted = Basis(theta).predict_left_out(values)
+    for k in range(7):
+        others = np.delete(theta / theta[0], k, axis=0), np.delete(values, k, axis=0)
+        law = np.linalg.lstsq(*others)[0]
+        np.testing.assert_allclose(predicted[k], theta[k] / theta[0] @ law, rtol=1e-9)
+    theta[1:, 2] = 0.0  # the first point alone tells of the third function
+    assert np.isinf(Basis(theta).predict_left_out(values)).all()
+
+
+def test_an_inverse_of_a_covariance_gives_no_weight_to_what_never_varies() -> None:
+    covariance = np.array([[4.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 0.0]])
+    size = np.array([1e9, 1e-9, 1.0])
+    inverse = np.array([[1.0, -1.0, 0.0], [-1.0, 4.0, 0.0], [0.0, 0.0, 0.0]]) / 3.0
+    found = invert_covariance(covariance * np.outer(size, size)) * np.outer(size, size)
+    np.testing.assert_allclose(found, inverse, rtol=1e-12, atol=1e-14)
 
 
 def test_a_fit_that_failed_tells_nothing_and_counts_as_missed() -> None:

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from ep2sindy.thruster.constants import E_CHARGE
+from ep2sindy.thruster import closures
+from ep2sindy.thruster.constants import E_CHARGE, M_ELECTRON
 from ep2sindy.thruster.plane import heavy_kernels as heavy
 from ep2sindy.thruster.plane import kernels
 from ep2sindy.thruster.plane.electron_kernels import electron_step
@@ -15,6 +16,7 @@ from ep2sindy.thruster.plane.simulate import (
     initial_state,
 )
 from ep2sindy.thruster.plane.state_kernels import new_work
+from tests.thrusters import at, slope_at
 
 DT_S = 1e-8
 N_STEPS = 20  # until ions move along r, too
@@ -32,6 +34,8 @@ def moving(request):
     for _ in range(N_STEPS):
         heavy.heavy_step(state, model, DT_S, work)
         assert electron_step(state, model, DT_S, work.columns)
+    state.gas.flux_z[grid.exit_column] *= -0.1  # back to the thruster's front face
+    heavy.velocities(state.gas, model)
     return grid, model, state, work
 
 
@@ -153,6 +157,97 @@ def test_a_heavy_step_is_heuns_step_of_the_scheme(moving):
     assert state.left[0] == pytest.approx(left, rel=1e-13)
 
 
+def plain_columns(grid, model, state):
+    """Sums over r, and what electrons lose by collisions, with its slope in T_e."""
+    gas, T, table = state.gas, state.T_e_eV, model.table
+    n, area = np.where(grid.plasma, gas.n, 1.0), np.where(grid.plasma, grid.area, 0.0)
+    products = n, gas.flux_z, n * gas.neutrals, n * n, n * np.log(n)
+    n_a, flux, n_nn, n_n, n_log = ((area * each).sum(axis=1) for each in products)
+    flux += model.dz * (np.cumsum(state.side) - 0.5 * state.side)
+    hot = T + 2.0 / 3.0 * model.drift_weight * state.drift_eV
+    log_lambda = at(table, closures.COULOMB_LOG, T) - 0.5 * np.log(n_n / n_a)
+    with_neutrals = at(table, closures.MOMENTUM, T) + at(table, closures.EVENTS, hot)
+    nu = n_nn * with_neutrals + n_n * log_lambda * at(table, closures.COULOMB, T)
+    nu = (nu + state.wall * at(table, closures.WALL_COLLISION, hot)) / n_a + model.anomalous
+    of_side = 2.5 * state.side
+    loss, slope = (
+        n_nn * value(table, closures.INELASTIC, hot)
+        + state.wall * value(table, closures.WALL_POWER, hot)
+        for value in (at, slope_at)
+    )
+    losses = loss + of_side * T, np.maximum(slope, 0.0) + of_side
+    return n_a, flux, n_log / n_a, nu, losses, at(table, closures.IONIZATION, hot)
+
+
+def with_ends(T, model):
+    """Temperatures along z, with those half a cell outside both ends."""
+    edge = model.boundary_T_e_eV
+    first, last = (max(2.0 * edge - T[k], 0.3 * edge) for k in (0, -1))
+    return np.r_[first, T, last]
+
+
+def centred(q, model):
+    return (q[2:] - q[:-2]) / (2.0 * model.dz)
+
+
+def plain_temperature(T, n, flux, conductance, losses, heating, state, model):
+    """The implicit step of the electrons' heat, by a dense solver. flux: of electrons."""
+    edge, conducts = model.boundary_T_e_eV, model.conduction_factor * conductance / model.dz
+    (loss, slope), product = losses, conducts * T
+    ends = 2.0 * edge * conducts[[0, -1]]
+    kappa = np.r_[ends[0], 0.5 * (product[1:] + product[:-1]), ends[1]]
+    convection = 2.5 * np.r_[flux[0], 0.5 * (flux[1:] + flux[:-1]), flux[-1]]
+    p = convection / kappa
+    down, up = kappa * p / -np.expm1(-p), kappa * p / np.expm1(p)  # flux: down T - up T_next
+    s, dt = DT_S / model.dz, DT_S
+    matrix = np.diag(1.5 * n + dt * slope + s * (up[:-1] + down[1:]))
+    matrix -= s * (np.diag(down[1:-1], -1) + np.diag(up[1:-1], 1))
+    known = state.energy + dt * (slope * T + heating - loss)
+    known[0], known[-1] = known[0] + s * down[0] * edge, known[-1] + s * up[-1] * edge
+    return np.linalg.solve(matrix / n[:, None], known / n)
+
+
+@pytest.mark.parametrize("drift_weight", [0.0, 1.0])
+def test_an_electron_step_is_that_of_the_scheme(moving, drift_weight):
+    grid, model, state, work = moving
+    model = model._replace(drift_weight=drift_weight)
+    state.T_e_eV[0] = 2.0 * model.boundary_T_e_eV  # beyond what a ghost cell mirrors
+    n, flux, log_ref, nu, losses, ionization = plain_columns(grid, model, state)
+    T, log_n = state.T_e_eV.copy(), np.log(np.where(grid.plasma, state.gas.n, 1.0))
+    conductance = n * E_CHARGE / M_ELECTRON * nu / (nu**2 + model.omega_ce**2)
+    around = with_ends(T, model)
+    beyond = np.pad(log_ref, 1, mode="edge")
+    gradient = centred(around, model) + T * centred(beyond, model)
+    drive = model.voltage + model.dz * (flux / conductance + gradient).sum()
+    current = drive / (model.resistance + model.dz * (1.0 / conductance).sum() / E_CHARGE)
+    electrons = flux - current / E_CHARGE
+    climb = electrons / conductance + gradient
+    drift = 0.5 * electrons**2 / (n * conductance * nu)
+    # What lies before the front face repeats the plume's first column.
+    before, column = grid.exit_column - 1, ~grid.plasma[grid.exit_column - 1]
+    log_n[before, column] = log_n[before + 1, column]
+    pressure = around[:, None] * (np.pad(log_n, ((1, 1), (0, 0)), mode="edge") - beyond[:, None])
+    new = plain_temperature(T, n, electrons, conductance, losses, electrons * climb, state, model)
+    assert electron_step(state, model, DT_S, work.columns)
+    assert state.current[0] == pytest.approx(current, rel=1e-12)
+    for found, expected in (
+        (state.ionization, ionization), (state.reference_field, -climb), (state.drift_eV, drift),
+        (state.E[grid.plasma], (-climb[:, None] - centred(pressure, model))[grid.plasma]),
+        (state.T_e_eV, new), (state.energy, 1.5 * n * new),
+        (state.log_n[grid.plasma], log_n[grid.plasma]),
+    ):  # fmt: skip
+        agree(found, expected)
+
+
+@pytest.mark.parametrize("place", [-1e-6, 0.0, 1.0, np.nan])
+def test_electrons_beyond_the_table_break_the_run(moving, place):
+    """The table's last row has no next one to interpolate to."""
+    _, model, state, work = moving
+    state = state._replace(T_e_eV=state.T_e_eV.copy())
+    state.T_e_eV[3] = closures.TABLE_TOP_EV + place if place >= 0.0 else place
+    assert not electron_step(state, model, DT_S, work.columns)
+
+
 def test_the_fastest_rate_is_that_of_the_fastest_cell(moving):
     grid, model, state, _ = moving
     c = np.sqrt(model.electron_sound_squared * state.T_e_eV + model.ion_sound_squared)[:, None]
@@ -171,5 +266,9 @@ def test_a_share_of_the_state_is_added_to_the_sample(moving):
         assert (plane[~inside] == 1.0).all()
     along = (state.T_e_eV, state.ionization, state.reference_field)
     np.testing.assert_allclose(profiles, 2.0 + 0.25 * np.array(along), rtol=1e-15)
-    expected = [3.0 + 0.25 * state.current[0], 3.0 + 0.25 * kernels.thrust(state, model)]
-    np.testing.assert_allclose(numbers, expected, rtol=1e-15)
+    ends = model.area * gas.flux_z[-1] * gas.u_z[-1]
+    plume = np.s_[grid.exit_column :, [0, -1]]
+    sides = model.perimeter[[0, -1]] * np.maximum(gas.u_r[plume] * [-1.0, 1.0], 0.0)
+    thrust = model.ion_mass * (ends.sum() + model.dz * (gas.flux_z[plume] * sides).sum())
+    expected = [3.0 + 0.25 * state.current[0], 3.0 + 0.25 * thrust]
+    np.testing.assert_allclose(numbers, expected, rtol=1e-14)

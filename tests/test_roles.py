@@ -9,7 +9,7 @@ import ep2sindy as ep
 from ep2sindy.data.coerce import DiscoveryProblem
 from ep2sindy.library.roles import constraint_of, process_amounts
 from ep2sindy.selection.conserving import search_conserving_systems
-from ep2sindy.selection.systems import TrialSystem
+from ep2sindy.selection.systems import TrialSystem, find_broken_demands
 
 STATES = ["n_i", "n_n"]
 LIBRARY = ep.polynomial(STATES, degree=2)
@@ -40,11 +40,26 @@ def test_every_role_has_its_terms_and_no_other():
     assert moved[3][2] == {("n_n", "n_i*n_n"): -1.0, ("n_i", "n_i*n_n"): 1.0}
     out = [each[1:] for each in found if each[0] == "n_i out"]
     assert out == [("n_i", {("n_i", "n_i"): -1.0}), ("n_i^2", {("n_i", "n_i^2"): -1.0})]
+    assert {p.role for p in ROLES.processes(LIBRARY, STATES) if p.one_sign} == {
+        "n_i out",
+        "n_n out",
+    }
     free = ep.Roles(inflow={"n_n": "free"}).processes(LIBRARY, STATES)
     assert [(p.role, p.term) for p in free if p.role.startswith("n_n")] == [("n_n in", "1")]
     assert [p.term for p in free if p.role == "n_i free"] == list(LIBRARY.names)
     named = ep.Roles(outflow={"n_n": ["n_n*n_i"]}).processes(LIBRARY, STATES)
-    assert [p.term for p in named if p.role == "n_n out"] == ["n_i*n_n"]
+    leaving = [(p.term, p.one_sign) for p in named if p.role == "n_n out"]
+    assert leaving == [("n_i*n_n", False)]
+
+
+def test_what_leaves_one_volume_fills_another_by_the_ratio_of_their_sizes():
+    states, library = ["a", "b", "c"], ep.polynomial(["a", "b", "c"])
+    roles = ep.Roles(exchange=[("a + a", "b + c", ["a^2"])], sizes={"a": 2.0, "b": 98.0})
+    process = roles.processes(library, states)[0]
+    moved = {"a": -2.0, "b": 2.0 / 98.0, "c": 2.0}  # a b and a c for two a
+    assert process.factors == {(state, "a^2"): factor for state, factor in moved.items()}
+    held = constraint_of(library, ["b", "a", "c"], [process])
+    assert held.C.ravel().tolist() == [1.0, -98.0, 98.0]  # 2 / (2 / 98) is 98.00000000000001
 
 
 def test_the_constraint_is_that_of_the_processes():
@@ -141,6 +156,21 @@ def test_a_search_by_mass_action_proposes_positive_processes_alone(record):
     assert min(amounts) < 0.0  # without mass action some are negative
 
 
+def test_broken_demands_are_named():
+    chosen = processes(
+        ("n_n to n_i", "n_i*n_n"), ("n_n to n_i", "n_i"), ("n_i out", "n_i"), ("n_n out", "n_n")
+    )  # fmt: skip
+    chosen.append(replace(chosen[1], role="n_n free"))
+    means = np.array([1.0, 4.0, 1.0, 1.0, 1.0])
+    for values, broken in (
+        ([2.0, -0.25, 1.0, 1.0, -1.0], []),
+        ([2.0, -0.5, 1.0, 1.0, -1.0], ["n_n to n_i > 0 in the mean"]),
+        ([2.0, 1.0, 0.0, 1.0, 1.0], ["n_i out by n_i > 0", "n_i out > 0 in the mean"]),
+    ):
+        assert find_broken_demands(chosen, np.array(values), means) == broken
+        assert find_broken_demands(chosen, np.array(values), None) == broken[: len(broken) - 1]
+
+
 def amounts_of(found) -> list:
     return process_amounts(found.constraint, {s: found.model.terms(s) for s in STATES})
 
@@ -171,6 +201,8 @@ def test_what_is_stated_is_kept_next_to_what_is_found(record):
     [
         (lambda: ep.Roles(inflow={"x": "some"}), "must be a number in SI per second, a list"),
         (lambda: ep.Roles(outflow={"x": {"x": "fast"}}), "terms with their coefficients in SI"),
+        (lambda: ep.Roles(sizes={"x": 0.0}), "sizes must be positive numbers: x has 0.0"),
+        (lambda: ep.Roles(sizes={"x": np.inf}), "sizes must be positive numbers: x has inf"),
         (
             lambda: ep.Roles(inflow={"n_n": "known"}).processes(LIBRARY, STATES),
             "known only where a record gives them",

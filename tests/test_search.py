@@ -5,7 +5,7 @@ import pytest
 from sklearn.linear_model import Lasso
 
 from ep2sindy.library.library import named_terms
-from ep2sindy.regression.bootstraps import Bootstraps, pool_supports
+from ep2sindy.regression.bootstraps import Bootstraps, draw_resamples, pool_supports
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.search_kernels import lasso_path
 from ep2sindy.regression.searches import STLSQ, AdaptiveLasso, BestSubset, Search
@@ -156,6 +156,19 @@ def test_culled_terms_are_missing_from_their_bootstrap_alone() -> None:
     assert np.all(kept.sum(axis=1) == 3)
     assert not kept[:, 5].any()
     assert np.all(kept[:, :5].any(axis=0))
+
+
+def test_columns_have_unit_norm_in_every_draw() -> None:
+    problem = noisy_problem()
+    draws = draw_resamples(problem, Bootstraps(n=4), rng=np.random.default_rng(0))
+    rng = np.random.default_rng(0)
+    products, kept = Bootstraps(n=4).draw(problem, np.ones(6, dtype=bool), rng)
+    np.testing.assert_allclose(draws.xx.diagonal(axis1=1, axis2=2), kept, rtol=1e-14)
+    for k, mask in enumerate(kept):
+        norms = np.sqrt(products[k].diagonal()[:6])[mask]
+        np.testing.assert_allclose(draws.scale[k, mask], 1.0 / norms, rtol=1e-14)
+        np.testing.assert_allclose(draws.xy[k, 0, mask], products[k, 6, :6][mask] / norms)
+        assert draws.yy[k, 0] == products[k, 6, 6]
 
 
 def test_shares_count_bootstraps() -> None:

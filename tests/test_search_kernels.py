@@ -60,6 +60,23 @@ def test_supports_in_any_order_are_fitted_alone() -> None:
             np.testing.assert_allclose(fit, plain, atol=1e-11)
 
 
+def test_a_draw_is_fitted_by_its_own_best_support_of_the_size() -> None:
+    (xx, _), (xy, _), (yy, _) = random_grams(2, 6)
+    masks = np.array([[k in (i, j) for k in range(6)] for j in range(6) for i in range(j)])
+    found = [np.vstack([~masks[0], masks]), masks[:0]]  # none of the size in the second draw
+    scale = np.array([[2.0] * 6, [3.0] * 5 + [0.0]])  # which lacks the last term
+    draws = Resamples(
+        ["x"], np.array([xx] * 2), np.array([[xy]] * 2), np.full((2, 1), yy), scale, scale > 0.0,
+        True, 6,
+    )  # fmt: skip
+    coef = draws.fits(0, found, masks[-1])
+    fits = fit_masks(xx, xy, masks)
+    best = int(np.argmin([yy - 2.0 * fit @ xy + fit @ xx @ fit for fit in fits]))
+    assert best > 0
+    np.testing.assert_allclose(coef[0], 2.0 * fits[best], rtol=1e-12)
+    np.testing.assert_allclose(coef[1], [0.0] * 4 + [3.0 * xy[4] / xx[4, 4], 0.0], rtol=1e-12)
+
+
 @pytest.mark.parametrize("fraction", [0.5, 2.0])
 def test_all_routes_of_least_squares_have_one_rule_of_rank(fraction: float) -> None:
     """A column leaves half of the threshold, or twice; the rows, the Gram matrix and the kernel."""

@@ -75,6 +75,28 @@ def test_what_kernels_import_compiles_them_again_too() -> None:
     assert watched | {"compilation.py"} <= {path.name for path in compilation.sources()}
 
 
+CHECKED = """
+import numpy as np
+from ep2sindy.app.precompile import PARTS
+from ep2sindy.regression.gram_kernels import factorise
+for part in PARTS.values():
+    part()
+try:
+    factorise(np.eye(2), np.empty(1, dtype=np.int64), np.eye(2))
+except IndexError:
+    print("checked")
+"""
+
+
+@pytest.mark.slow
+def test_no_kernel_reads_or_writes_past_its_arrays(tmp_path: Path) -> None:
+    """Numba checks no index unless it is asked to, in kernels that are compiled for this."""
+    env = {**os.environ, "NUMBA_BOUNDSCHECK": "1", "EP2SINDY_CACHE": str(tmp_path)}
+    command = [sys.executable, "-c", CHECKED]
+    done = subprocess.run(command, env=env, capture_output=True, text=True)
+    assert done.stdout == "checked\n", done.stderr
+
+
 CALL = """
 import sys
 sys.path.insert(0, sys.argv[1])

@@ -11,7 +11,7 @@ from ep2sindy.refinement.refine import BatchRefinement, refine_batch, smooth_bat
 from ep2sindy.refinement.windows import WindowBatch, cut_windows
 from ep2sindy.regression.front import Candidate, ParetoFront
 from ep2sindy.runtime.progress import SILENT
-from ep2sindy.selection import systems
+from ep2sindy.selection import by_windows, systems
 from ep2sindy.selection.by_windows import WindowsLeftOut
 from ep2sindy.selection.criteria import MAX_ERROR
 from ep2sindy.systems.draws import realization
@@ -247,7 +247,56 @@ def test_a_refinement_that_ends_worse_than_it_began_is_not_kept() -> None:
     measure = WindowsLeftOut([run], run.states.std(axis=0), ["x", "y"], 2, 2)
     mended, spoilt = measure.assess([trial, trial], refined, batch, fold, SILENT)
     assert np.abs(mended).max() < 1e-3
+    half = replace(measure, spread=2.0 * measure.spread)
+    again = half.assess([trial, trial], refined, batch, fold, SILENT)
+    np.testing.assert_allclose(again, 0.5 * np.array([mended, spoilt]), rtol=1e-12)
     same = BatchRefinement([off, off], np.ones(2, dtype=np.bool_), np.ones(2))
     np.testing.assert_array_equal(
         spoilt, measure.assess([trial, trial], same, batch, fold, SILENT)[1]
     )
+
+
+def pieces_of(*lengths: int) -> list[ep.Trajectory]:
+    run = PREY.trajectory()
+    return [run.window(0, length) for length in lengths]
+
+
+@pytest.mark.parametrize(
+    ("lengths", "window"),
+    [
+        ([240, 100], 40),  # as wanted
+        ([100, 30], 21),  # three pairs of 130 samples
+        ([9, 10], 5),  # the fewest samples of a window
+        ([20] * 20, 10),  # half of the longest record
+    ],
+)
+def test_a_window_leaves_room_for_another(
+    monkeypatch: pytest.MonkeyPatch, lengths: list[int], window: int
+) -> None:
+    monkeypatch.setattr(by_windows, "dominant_window", lambda runs, states: 40)
+    runs = pieces_of(*lengths)
+    assert WindowsLeftOut(runs, np.ones(2), ["x", "y"], 20, 3).window == window
+    short = WindowsLeftOut([runs[0].window(0, 9), runs[0].window(0, 8)], *[None] * 4)
+    with pytest.raises(ValueError, match="of 5 samples or more, got at most 9; use longer records"):
+        _ = short.window
+
+
+def test_a_window_is_no_longer_than_the_longest_segment() -> None:
+    parts = [systems.Segment(0, 0, 60), systems.Segment(1, 20, 100)]
+    cut = systems.cut_segments(pieces_of(60, 100), parts, PREY.model, window=500, n_windows=2)
+    assert cut.data.shape[1] == 80
+
+
+def test_pairs_of_windows_are_spread_over_every_record_by_its_length() -> None:
+    measure = WindowsLeftOut(pieces_of(600, 300, 40), np.ones(2), ["x", "y"], 12, 3)
+    measure.__dict__["window"] = 30
+    starts = [(0, 0), (0, 180), (0, 360), (0, 540), (1, 0), (1, 240)]  # the last has no room
+    pairs = [systems.Segment(run, k, k + 30) for run, at in starts for k in (at, at + 30)]
+    assert [fold.held for fold in measure.folds] == [pairs[k::3] for k in range(3)]
+
+
+def test_residuals_alike_from_sample_to_sample_count_as_fewer() -> None:
+    same, turning = np.ones((3, 8, 1)), (-1.0) ** np.arange(24).reshape(3, 8, 1)
+    # rho = 7/8, and below zero, which adds nothing.
+    assert by_windows._independent(same) == pytest.approx(24 / 15, rel=1e-14)
+    assert by_windows._independent(np.dstack([same, turning])) == pytest.approx(24 / 15 + 24)

@@ -208,8 +208,8 @@ class Resamples:
                 same_size = (support & (self.scale[k] > 0.0))[None]
             xx, xy = self.xx[k], self.xy[k, equation]
             fits = fit_masks(xx, xy, same_size)
-            best = int(np.argmax(explained_squares(fits, xx, xy))) if len(fits) > 1 else 0
-            coef[k] = fits[best] * self.scale[k]
+            best = fits[np.argmax(explained_squares(fits, xx, xy))]
+            coef[k] = best * self.scale[k]
         return coef
 
 

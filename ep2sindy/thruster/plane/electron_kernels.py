@@ -191,7 +191,7 @@ def heat(state, model, dt, columns):
             )
             right += s * behind * edge
         inverse = 1.0 / (diagonal + s * before - lower * c)
-        c = -s * behind * inverse if i < last else 0.0
+        c = -s * behind * inverse
         d = (right - lower * d) * inverse
         columns.upper[i], columns.right[i] = c, d
     T[last] = columns.right[last]
