@@ -147,7 +147,7 @@ class Ray:
             import ray
             from ray.util.joblib import register_ray
         except ImportError as error:
-            raise ValueError("parallel=ray needs pip install ray") from error
+            raise ValueError("parallel=ray needs pip install 'ep2sindy[ray]'") from error
         try:
             ray.init(self.address, ignore_reinit_error=True, logging_level="error")
         except (ConnectionError, ValueError) as error:
