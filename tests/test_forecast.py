@@ -163,7 +163,7 @@ def test_widths_are_the_same_however_often_and_in_what_unit_they_are_asked_for()
 
 
 @pytest.mark.parametrize("n_groups", [5, 40])
-def test_a_width_is_that_of_a_normal_variable_stated_from_few(n_groups) -> None:
+def test_a_width_is_that_of_a_normal_variable_estimated_from_few(n_groups) -> None:
     """Of groups of starts that share one distance, it holds as many others as it should."""
     rng, held = np.random.default_rng(n_groups), []
     for _ in range(400):
@@ -172,7 +172,7 @@ def test_a_width_is_that_of_a_normal_variable_stated_from_few(n_groups) -> None:
     assert np.mean(held) == pytest.approx(0.9, abs=0.03)
 
 
-def test_no_band_is_shown_where_none_can_be_stated() -> None:
+def test_no_band_is_shown_where_none_can_be_estimated() -> None:
     few = spring(0.05).window(0, 9)
     ahead = ep.forecast(SPRING, few, 1.0)
     assert np.isnan(ahead.band()).all()
@@ -337,7 +337,7 @@ def test_a_history_whose_end_is_at_rest_is_forecast() -> None:
 
 
 @pytest.mark.usefixtures("few_starts")
-def test_the_noise_of_three_samples_is_not_stated() -> None:
+def test_the_noise_of_three_samples_is_not_estimated() -> None:
     few = spring(0.05).window(0, 3)
     with pytest.raises(
         ValueError, match="5 samples or more to tell its noise: got 3; pass the rec"

@@ -250,7 +250,7 @@ def estimate(
     library, constraint = task.library.with_known_terms(task.states), None
     if facts.roles is not None:
         played = compress(answer.solution.problem.processes, answer.solution.fit.free != 0.0)
-        constraint = constraint_of(library, task.states, list(played), facts.roles.stated)
+        constraint = constraint_of(library, task.states, list(played), facts.roles.known_processes)
     model = _model(answer, library, fitted[0][0].units, provenance or {})
     return replace(_report(answer, model, fitted, watch), constraint=constraint)
 
@@ -350,7 +350,7 @@ class _Way:
 
     def begin(self, settings: _Settings) -> Explanation:
         """Answer under process noise."""
-        return self._stated(explain_under_noise(self.problem, max_terms=settings.max_terms))
+        return self._with_warnings(explain_under_noise(self.problem, max_terms=settings.max_terms))
 
     def answer(self, settings: _Settings, under_noise: Explanation | None = None) -> Answer:
         """Answer by an exact trajectory, if one explains the samples; with the runs as fitted."""
@@ -369,9 +369,9 @@ class _Way:
             fitted = list(by_run(problem, paths, self.runs))
             if not problem.measured.all():
                 check_repeats([run for run, _ in fitted])
-        return self._stated(found), fitted
+        return self._with_warnings(found), fitted
 
-    def _stated(self, found: Explanation) -> Explanation:
+    def _with_warnings(self, found: Explanation) -> Explanation:
         return replace(found, data_warnings=(*self.words, *found.data_warnings))
 
 

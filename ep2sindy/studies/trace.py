@@ -121,7 +121,7 @@ class Study:
             raise ValueError(f"offset must be a number or fit, got {self.offset!r}")
 
     @property
-    def stated(self) -> StatedFacts:
+    def facts(self) -> StatedFacts:
         """What is known of the equations."""
         barred = {
             state: [str(name) for name in names] for state, names in (self.exclude or {}).items()
@@ -132,7 +132,7 @@ class Study:
         field, data = self._sampled(report)
         with resumed(self.keep, report) as keeping:
             signal = self._prepared(data, keeping.once, report)
-            self.stated.check(self.tried, signal)
+            self.facts.check(self.tried, signal)
             past = fitted_part(signal, self.held_out)
             linear = is_linear(past)
             if linear:
@@ -141,7 +141,7 @@ class Study:
             if question := ask_whether_driven(signal, beside):
                 report.warn(question)
             attempts = try_in_turn(
-                past, self.tried, self.method, stated=self.stated, linear=linear,
+                past, self.tried, self.method, facts=self.facts, linear=linear,
                 seed=report.seed, progress=report.watch, once=keeping.once,
             )  # fmt: skip
         best = best_of(attempts)
