@@ -298,10 +298,9 @@ def line(name: str, cases: Sequence[Case]) -> str:
         each.run.text for each in cases if each.run.status is not ep.model.Status.SUSTAINED
     )
     return (
-        f"{name:24s} {len(sustained)} of {len(cases)} live ({wrong} refuted); f {f} %; "
-        f"amplitude {amplitude} %; waveform {waveform}; free coefficients {n_free}; multiplier "
-        f"{multiplier}; starts that reach it {np.nanmin(fractions):.2f} to "
-        f"{np.nanmax(fractions):.2f}; "
+        f"{name:24s} {len(sustained)} of {len(cases)} live ({wrong} refuted); f {f} %; amplitude "
+        f"{amplitude} %; waveform {waveform}; free coefficients {n_free}; multiplier {multiplier}; "
+        f"starts that reach it {np.nanmin(fractions):.2f} to {np.nanmax(fractions):.2f}; "
         f"{cpu_s:.1f} CPU-s{f'; {dict(lost)}' if lost else ''}"
     )
 

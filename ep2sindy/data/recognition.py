@@ -202,8 +202,7 @@ class _Arrays:
             if each.falls and axis_of(each.name) == "time" and differs:
                 self.questions.append(
                     f"the times of {each.name!r} run over {each.high - each.low:.6g}, and samples "
-                    f"in the file's steps of {given_s:.6g} s over {span_s:.6g} s: give dt_s if "
-                    "the "
+                    f"in the file's steps of {given_s:.6g} s over {span_s:.6g} s: give dt_s if the "
                     "steps are equal, or the segments as files of their own"
                 )
                 return False

@@ -318,8 +318,7 @@ def _check_positive(signal: Signal) -> None:
     raise ValueError(
         f"a growth rate needs a positive signal: {signal.name} falls to {signal.x.min():.4g} "
         f"{signal.unit}, {fraction:.2g} % of its samples are zero or less, and noise does not "
-        "explain "
-        "it; take its derivative instead (derivative), or an offset out of it"
+        "explain it; take its derivative instead (derivative), or an offset out of it"
     )
 
 

@@ -482,8 +482,7 @@ def scale_steps(
     if len(t) < least or len(values) != len(t):
         raise ValueError(
             f"smoothing needs at least {least} samples, one row of values per time, got "
-            f"{len(values)} "
-            f"rows with {len(t)} times; join more data"
+            f"{len(values)} rows with {len(t)} times; join more data"
         )
     check_time(t)
     step_s = float(t[-1] - t[0]) / (len(t) - 1)

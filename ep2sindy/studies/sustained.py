@@ -70,9 +70,8 @@ class SustainedSearch:
     def __post_init__(self) -> None:
         if self.selection.basis != "runs":
             raise ValueError(
-                "whether a model sustains its oscillation shows when it runs: selection must be "
-                "a rule that runs models, "
-                f"such as FreeRunScore(), got {self.selection!r}"
+                "whether a model sustains its oscillation shows when it runs: selection must be a "
+                f"rule that runs models, such as FreeRunScore(), got {self.selection!r}"
             )
 
     def found(
