@@ -49,9 +49,7 @@ from ep2sindy.runtime.values import check_count
 
 MAX_RIVALS = 5
 MIN_ODDS = 1e-3  # rivals with lower posterior odds are not reported
-MIN_PROBABILITY = (
-    0.5  # least probability of all supports; with less, the samples do not tell which it is
-)
+MIN_PROBABILITY = 0.5  # of all supports; with less, the samples do not tell which it is
 EVEN = 0.2  # above these posterior odds of a rival, the choice is reported as ambiguous
 
 
@@ -506,13 +504,13 @@ def _open_choice(
     Penalties of terms are log prior odds, so scores give posterior probabilities (Schwarz 1978,
     doi:10.1214/aos/1176344136).
     """
-    fraction = 1.0
+    chance = 1.0
     for weighed in supports.values():
-        fraction /= sum(each.odds for each in weighed)
-    if fraction >= MIN_PROBABILITY:
+        chance /= sum(each.odds for each in weighed)
+    if chance >= MIN_PROBABILITY:
         return ""
     return (
         f"{problem.n_samples} samples do not tell these equations from others: the chance that all "
-        f"terms are right is {100.0 * fraction:.0f} %; name the terms that you know "
+        f"terms are right is {100.0 * chance:.0f} %; name the terms that you know "
         "(Library.only), take a smaller library, or a longer record"
     )

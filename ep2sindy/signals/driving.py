@@ -38,9 +38,8 @@ MIN_PERIODS_OF_PHASE = 20
 # Mean square of a random walk of n unit steps about its best line, over n: one in a hundred walks
 # of twenty steps is below this, and fewer of longer ones (simulated).
 LEAST_WALK = 0.0147
-LEAST_MOVES = (
-    4.0  # least square of a phase's moves over that of noise, of twenty moves: five errors
-)
+# Least square of a phase's moves over that of noise, of twenty moves: five errors.
+LEAST_MOVES = 4.0
 MISSED = 1.64  # of white noise: its variance, and that between the other samples, of 0.64
 N_POINTS = 64  # in a period, between samples by cubic splines
 SETTLED = 3  # a phase is looked at after the first of so many parts of a record, a transient
@@ -49,10 +48,8 @@ HELD, SWEPT, SINE = "held between steps", "a triangle or a sweep", "a sine"
 RESTING = 0.5  # least fraction of steps in which a held column rests
 LEAP = 0.1  # least median move of a held column, as a fraction of its range: no coarse scale
 EVEN = 0.05  # most distance of a sweep's values from an even spread; a sine's is 0.1
-PURE, PURER = (
-    2.5e-3,
-    20.0,
-)  # largest fraction that is no sine in one, and least ratio to the others'
+# Largest fraction that is no sine in one, and least ratio to the others'.
+PURE, PURER = 2.5e-3, 20.0
 FORETOLD = 0.1  # least fraction of the error of a forecast that a drive takes away
 N_AHEAD, N_LAGS = 12, 3  # steps in a period, and how many of them, by which a signal is foretold
 

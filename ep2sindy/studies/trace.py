@@ -274,7 +274,7 @@ def _add_signal(
     per_period = signal.period_s / states.dt_s
     turns = "periods" if signal.cycle is not None else "turns, which do not repeat themselves,"
     too_fast = "" if embedding.how == "hidden" else ", and what is too fast to be followed"
-    fraction = 100.0 * best.noise_std / signal.x.std()
+    percentage = 100.0 * best.noise_std / signal.x.std()
     noise = f"{best.noise_std:.3g} {signal.unit}".removesuffix(" 1")
     moves = ", ".join(f"{state} by {size:.2g}" for state, size in best.process_noise_std.items())
     exact = ", ".join(f"{state}' = {term.replace('*', ' ')}" for state, term in known.items())
@@ -284,7 +284,7 @@ def _add_signal(
         f"{per_period:.0f} samples",
         f"states: {embedding.says}, {', '.join(states.state_names)} ({best.states.reason})"
         f"{'; known: ' if exact else ''}{exact}",
-        f"noise{too_fast}: {noise}, {fraction:.2g} % of the standard deviation",
+        f"noise{too_fast}: {noise}, {percentage:.2g} % of the standard deviation",
         f"process noise, which moves the states at random in every step: {moves} (SI)",
         *signal.done,
     )
