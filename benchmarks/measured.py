@@ -241,10 +241,9 @@ def hidden() -> None:
             held.append(skill.coverage_90)
         print(
             f"{words}, 5 % noise: law right in {right} of {N_DRAWS}, {sum(inside)} of "
-            f"{len(inside)} intervals hold; nearer than the autoregression over {N_CYCLES} "
-            f"cycles in {nearer}, bands of 90 % hold {100 * np.mean(held):.1f} % "
-            f"({100 * min(held):.0f} to {100 * max(held):.0f}); a search takes "
-            f"{np.median(cpu_s):.2g} CPU-s",
+            f"{len(inside)} intervals hold; nearer than the autoregression over {N_CYCLES} cycles "
+            f"in {nearer}, bands of 90 % hold {100 * np.mean(held):.1f} % ({100 * min(held):.0f} "
+            f"to {100 * max(held):.0f}); a search takes {np.median(cpu_s):.2g} CPU-s",
             flush=True,
         )
     for voltage, flow in POINTS:

@@ -25,7 +25,7 @@ N_STARTS = 64
 
 @dataclass(frozen=True)
 class Network:
-    """Equations, a start, the length of the record, and what is stated of the roles."""
+    """Equations, a start, the length of the record, and what is known of the roles."""
 
     equations: Mapping[str, Mapping[str, float]]
     start: tuple[float, ...]

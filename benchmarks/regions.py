@@ -106,8 +106,7 @@ def three_regions(
         raise ValueError(
             "a field of three regions needs three sets of equations, two points or more along "
             f"every axis, and dt_s and transition above 0, got {list(regions)}, n_z={n_z}, "
-            f"n_r={n_r}, "
-            f"n_samples={n_samples}, dt_s={dt_s}, transition={transition}"
+            f"n_r={n_r}, n_samples={n_samples}, dt_s={dt_s}, transition={transition}"
         )
     channel = thruster or Thruster()
     # Cell centres, as fractions of the channel's length and gap.

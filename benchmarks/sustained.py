@@ -29,7 +29,7 @@ from benchmarks.source import measured_sets, named_set
 from ep2sindy.data.sampling import ZoneAverage, side_by_side
 from ep2sindy.library.relations import Constraint
 from ep2sindy.regression.searches import Search
-from ep2sindy.studies.processes import ComparedProcess, Zones, compared_processes, stated_roles
+from ep2sindy.studies.processes import ComparedProcess, Zones, compared_processes, fit_roles
 from ep2sindy.studies.sustained import start_of
 
 POINTS = {point.label: point for point in ep.thruster.OPERATING_POINTS}
@@ -199,7 +199,7 @@ def under(
 
 def known_of(fitted: ep.Trajectory, whole: Record) -> dict[str, dict[str, float]]:
     """What the record tells of the roles of a zone, by least squares over what is fitted."""
-    found = stated_roles(whole.balances, fitted)
+    found = fit_roles(whole.balances, fitted)
     return {name: dict(role.terms) for name, role in found.items()}
 
 
@@ -298,10 +298,9 @@ def line(name: str, cases: Sequence[Case]) -> str:
         each.run.text for each in cases if each.run.status is not ep.model.Status.SUSTAINED
     )
     return (
-        f"{name:24s} {len(sustained)} of {len(cases)} live ({wrong} refuted); f {f} %; "
-        f"amplitude {amplitude} %; waveform {waveform}; free coefficients {n_free}; multiplier "
-        f"{multiplier}; starts that reach it {np.nanmin(fractions):.2f} to "
-        f"{np.nanmax(fractions):.2f}; "
+        f"{name:24s} {len(sustained)} of {len(cases)} live ({wrong} refuted); f {f} %; amplitude "
+        f"{amplitude} %; waveform {waveform}; free coefficients {n_free}; multiplier {multiplier}; "
+        f"starts that reach it {np.nanmin(fractions):.2f} to {np.nanmax(fractions):.2f}; "
         f"{cpu_s:.1f} CPU-s{f'; {dict(lost)}' if lost else ''}"
     )
 

@@ -9,7 +9,7 @@ documentation and for what configs may call. Of its lines are read
     from ep2sindy.data.open import open_field as open_field  # for configs
 
 and a config may call what is marked so and nothing else, for a config can come from anybody:
-values, readers and simulators are marked; what writes where it is stated, or runs what it is given,
+values, readers and simulators are marked; what writes where it is told, or runs what it is given,
 must never be.
 """
 

@@ -100,11 +100,11 @@ async def _seen(
     found, count = Seen(width_px), 0
 
     def note(message: dict[str, Any]) -> None:
-        method, stated = message.get("method"), message.get("params", {})
+        method, params = message.get("method"), message.get("params", {})
         if method == "Network.requestWillBeSent":
-            found.asked.append(stated["request"]["url"][:200])
+            found.asked.append(params["request"]["url"][:200])
         if method in ("Runtime.consoleAPICalled", "Runtime.exceptionThrown", "Log.entryAdded"):
-            found.console.append(json.dumps(stated)[:500])
+            found.console.append(json.dumps(params)[:500])
 
     async def call(method: str, **arguments: Any) -> Any:
         nonlocal count

@@ -22,8 +22,8 @@ def model_of(
 
 def slopes_of(library: Library, values: np.ndarray) -> np.ndarray:
     """Derivative of every term by every variable, (variables, samples, terms)."""
-    products, fractions = library.with_derivatives(len(library.variables))
-    return np.einsum("sp,tvp->vst", products.evaluate(values), fractions[:, 1:])
+    products, weights = library.with_derivatives(len(library.variables))
+    return np.einsum("sp,tvp->vst", products.evaluate(values), weights[:, 1:])
 
 
 def plain_rows(

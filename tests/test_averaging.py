@@ -62,7 +62,7 @@ def test_means_of_several_records_are_alike_and_cross_no_gap() -> None:
     assert (steps > 1.5 * np.median(steps)).sum() == 1
 
 
-def test_records_stay_as_they_are_that_are_short_or_lack_samples_or_are_stated_to() -> None:
+def test_records_stay_as_they_are_that_are_short_or_lack_samples_or_are_told_to() -> None:
     run = damped()
     missing = np.zeros((run.n_samples, 2), dtype=np.bool_)
     missing[5, 0] = True

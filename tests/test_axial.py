@@ -192,7 +192,7 @@ def test_a_stretched_grid_has_long_cells_in_the_plume():
 @pytest.mark.parametrize(
     ("f_Hz", "status"), [(15e3, "oscillating"), (58e3, "oscillating"), (143e3, "transit")]
 )
-def test_a_transit_oscillation_is_stated_from_breathing(f_Hz, status):
+def test_a_transit_oscillation_is_told_from_breathing(f_Hz, status):
     t = 1.5e-6 * np.arange(4000)
     assert assess_status(4.0 + np.sin(2e0 * np.pi * f_Hz * t), 1.5e-6) == status
 

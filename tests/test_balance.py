@@ -9,7 +9,7 @@ import xarray as xr
 import ep2sindy as ep
 from ep2sindy.library.roles import constraint_of, sum_known
 from ep2sindy.studies.balance import model_balance
-from ep2sindy.studies.processes import Zones, compared_processes, stated_roles
+from ep2sindy.studies.processes import Zones, compared_processes, fit_roles
 from ep2sindy.studies.source import split_in_time
 from tests.thrusters import brief
 
@@ -53,21 +53,21 @@ def test_the_supply_is_the_mass_flow(field: xr.Dataset, exact: xr.Dataset) -> No
     assert field.attrs["neutral_inflow"] == pytest.approx(particles)
     length_m = float(field["dz"].values[field["z"].values <= 0.025].sum())
     assert exact["supply"].values == pytest.approx(particles / length_m, rel=1e-5)
-    stated = stated_roles({"": exact}, ep.zone_average(field, CHANNEL, states=STATES))
-    assert stated["n_n in"].terms == {"1": pytest.approx(particles / length_m, rel=1e-5)}
+    found = fit_roles({"": exact}, ep.zone_average(field, CHANNEL, states=STATES))
+    assert found["n_n in"].terms == {"1": pytest.approx(particles / length_m, rel=1e-5)}
 
 
-def test_what_leaves_and_comes_back_is_stated_by_least_squares(exact: xr.Dataset, data) -> None:
+def test_what_leaves_and_comes_back_is_fitted_by_least_squares(exact: xr.Dataset, data) -> None:
     """A balance that is made of the terms themselves gives their coefficients."""
     n_i, n_n = data.states.T
     made = exact.assign(
         exit_n=("time", 3e3 * n_n + 2e-16 * n_i * n_n), returned=("time", 1e5 * n_i)
     )
-    stated = stated_roles({"": made}, data)
-    assert stated["n_n out"].terms == pytest.approx({"n_n": 3e3, "n_i*n_n": 2e-16}, rel=1e-6)
-    assert stated["n_i to n_n"].terms == pytest.approx({"n_i": 1e5}, rel=1e-6)
-    assert stated["n_n out"].r2 == pytest.approx(1.0)
-    half = stated_roles({"": made}, data.window(0, data.n_samples // 2))
+    found = fit_roles({"": made}, data)
+    assert found["n_n out"].terms == pytest.approx({"n_n": 3e3, "n_i*n_n": 2e-16}, rel=1e-6)
+    assert found["n_i to n_n"].terms == pytest.approx({"n_i": 1e5}, rel=1e-6)
+    assert found["n_n out"].r2 == pytest.approx(1.0)
+    half = fit_roles({"": made}, data.window(0, data.n_samples // 2))
     assert half["n_i to n_n"].terms == pytest.approx({"n_i": 1e5}, rel=1e-6)
 
 
@@ -90,7 +90,7 @@ def test_a_file_gives_what_it_can(field: xr.Dataset) -> None:
     downstream = ep.thruster.zone_balance(field, ep.Zone(z="downstream"))
     assert "supply" not in downstream  # what enters through an inner face is not known beforehand
     run = ep.zone_average(field, ep.Zone(z="downstream"), states=STATES)
-    assert "n_n in" not in stated_roles({"": downstream}, run)
+    assert "n_n in" not in fit_roles({"": downstream}, run)
 
 
 @pytest.fixture(scope="module")
@@ -108,9 +108,9 @@ def under(roles: ep.Roles, values: dict[tuple[str, str], float]):
     """The model whose processes have these coefficients, by role and term, and its constraint."""
     library = ep.polynomial(STATES, degree=2)
     chosen = [p for p in roles.processes(library, STATES) if (p.role, p.term) in values]
-    held_to = constraint_of(library, STATES, chosen, roles.stated)
+    held_to = constraint_of(library, STATES, chosen, roles.known_processes)
     assert held_to is not None
-    known = sum_known(roles.stated)
+    known = sum_known(roles.known_processes)
     coef = np.array([known.get(at, 0.0) for at in held_to.coefficients])
     for process in chosen:
         fractions = [process.factors.get(at, 0.0) for at in held_to.coefficients]
@@ -147,7 +147,7 @@ def test_processes_of_a_conserving_model(data: ep.Trajectory, exact: xr.Dataset)
 
 
 def test_what_ions_give_back_by_a_process_of_their_own_is_compared(data, exact) -> None:
-    """Told or found, it stands next to what walls and anode give back, and ionization is whole."""
+    """Stated or found, it stands next to what walls and anode give back; ionization is whole."""
     stated = replace(ROLES, exchange=[("n_n", "n_i"), ("n_i", "n_n", {"n_i": 1e5})])
     free = VALUES | {("n_i to n_n", "n_i"): 1e5}
     for roles, values in ((stated, VALUES), (ROLES, free)):

@@ -16,13 +16,11 @@ from ep2sindy.forecasting.baselines import (
 )
 
 
-def oscillator(
-    n: int = 3000, *, with_process_noise: float = 0.01, level: float = 0.1
-) -> np.ndarray:
+def oscillator(n: int = 3000, *, process_noise: float = 0.01, level: float = 0.1) -> np.ndarray:
     """An autoregression of order two that is moved at random at every step."""
     rng, x = np.random.default_rng(0), [0.0, 0.0]
     for _ in range(n):
-        x.append(1.6 * x[-1] - 0.9 * x[-2] + level + with_process_noise * rng.standard_normal())
+        x.append(1.6 * x[-1] - 0.9 * x[-2] + level + process_noise * rng.standard_normal())
     return np.array(x[2:])
 
 
@@ -58,7 +56,7 @@ def test_several_states_regress_on_each_other() -> None:
 
 
 def test_positive_signals_regress_in_logarithms_where_these_are_likelier() -> None:
-    x = oscillator(with_process_noise=0.3)
+    x = oscillator(process_noise=0.3)
     assert Autoregression.of(record(np.exp(x))).least is not None
     assert Autoregression.of(record(x + 20.0)).least is None
     grows = record(np.exp(x))

@@ -28,7 +28,7 @@ STLSQ_ = Regression(Differential(), STLSQ(), Knee(), Bootstraps(n=0))
 
 @dataclass
 class Scripted:
-    """Gives the findings it was stated to give, and keeps the random numbers it was given."""
+    """Gives the findings it was told to give, and keeps the random numbers it was given."""
 
     findings: list[Finding]
     drawn: list[float] = field(default_factory=list)

@@ -54,8 +54,8 @@ def test_two_runs_are_set_side_by_side(
     runs: tuple[Path, Path], capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     compare([*map(str, runs), "--page", str(tmp_path / "both.html")])
-    stated = capsys.readouterr().out
-    rows = [" ".join(line.replace("│", " ").split()) for line in stated.splitlines()]
+    printed = capsys.readouterr().out
+    rows = [" ".join(line.replace("│", " ").split()) for line in printed.splitlines()]
     for row in (
         "search.max_terms 3 4",
         "one: frequency 1.5 kHz 2 kHz +33 %",
@@ -77,9 +77,9 @@ def test_the_jobs_of_a_sweep_are_compared_but_for_those_that_failed(
     write_json(sweep / "jobs" / "0.json", {"folder": str(runs[0])})
     capsys.readouterr()
     compare([str(sweep), "--page", str(page)])
-    stated = capsys.readouterr().out
-    assert stated.startswith("left out: job 10 failed: no\n")
-    assert "search.max_terms" in stated
+    printed = capsys.readouterr().out
+    assert printed.startswith("left out: job 10 failed: no\n")
+    assert "search.max_terms" in printed
     assert page.is_file()
     write_json(sweep / "jobs" / "3.json", {"folder": 1})
     with pytest.raises(ValueError, match=r"3\.json cannot be read: it is damaged"):

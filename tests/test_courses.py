@@ -69,7 +69,7 @@ def test_a_square_wave_of_a_model_made_by_hand_does_not_overshoot() -> None:
 @pytest.mark.parametrize("hold", [1, 20])
 @pytest.mark.parametrize("course", ["held", "linear"])
 def test_the_course_is_found_with_the_law(course: str, hold: int) -> None:
-    """An input that is held is half a step delayed for a linear one, and no state comes late."""
+    """An input that is held is half a step late for a linear one, and no state comes late."""
     found = ep.estimate([lag(course, hold=hold, seed=2, noise=0.05, n=800)], LIBRARY)
     assert not found.lack_of_fit
     assert set(found.model.terms("x")) == {"x", "u"}
@@ -81,8 +81,8 @@ def test_the_course_is_found_with_the_law(course: str, hold: int) -> None:
 
 def test_a_course_that_is_stated_is_kept() -> None:
     run = lag("held", hold=1, seed=3, noise=0.05)
-    stated = ep.discover(run, LIBRARY, method=ep.TrajectorySearch(courses={"u": "linear"}))
-    assert dict(stated.model.courses) == {"u": "linear"}
+    found = ep.discover(run, LIBRARY, method=ep.TrajectorySearch(courses={"u": "linear"}))
+    assert dict(found.model.courses) == {"u": "linear"}
     with pytest.raises(ValueError, match=r"courses must give one of .* got 'u': 'stepped'"):
         ep.estimate([run], LIBRARY, courses={"u": "stepped"})
 

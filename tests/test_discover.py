@@ -224,7 +224,7 @@ def test_a_state_whose_rows_cannot_be_whitened_leaves_the_others_tested(
     assert list(found.noise_test.left) == ["y"]
 
 
-def test_a_rule_that_assess_free_runs_says_a_lack_of_fit_where_others_do() -> None:
+def test_a_rule_that_assesses_free_runs_says_a_lack_of_fit_where_others_do() -> None:
     run = replace(lotka_volterra(), rate_Hz=5.0).trajectory(noise=0.05, rng=0)
     rule = FreeRunScore(n_windows=4, n_folds=2)
     recipe = Regression(WeightedWeak(), BestSubset(max_terms=2), rule, Bootstraps(n=0))

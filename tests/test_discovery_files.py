@@ -1,4 +1,4 @@
-"""A discovery that is stored says all that it stated, and a file from someone else runs nothing."""
+"""A discovery that is stored says all that it said, and a file from someone else runs nothing."""
 
 import json
 from dataclasses import replace
@@ -58,7 +58,7 @@ def test_a_constraint_that_was_stored_serves_a_refinement() -> None:
     assert one == other
 
 
-def test_rows_are_not_stored_and_who_needs_them_is_stated() -> None:
+def test_rows_are_not_stored_and_who_needs_them_is_told() -> None:
     again = ep.Discovery.from_json(found("bootstraps").to_json())
     assert again.estimate is None
     with pytest.raises(ValueError, match="a discovery that was stored keeps none"):

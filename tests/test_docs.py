@@ -270,8 +270,8 @@ def test_the_messages_that_the_faq_quotes_are_those_of_the_package() -> None:
     """`...` stands for what a message says of names and numbers."""
     quotes = re.findall(r'^### "(.*)"$', (ROOT / "docs" / "faq.md").read_text("utf-8"), re.M)
     assert len(quotes) > 15
-    stated = "\0".join(messages())
-    lost = [quote for quote in quotes if not is_of(quote, stated)]
+    said = "\0".join(messages())
+    lost = [quote for quote in quotes if not is_of(quote, said)]
     assert not lost, "\n".join(lost)
 
 
@@ -321,9 +321,9 @@ def test_the_example_of_a_docstring_runs(name: str, here: Path) -> None:
     write_field(three_regions(n_z=6, n_r=5, n_samples=300).field, here / "run.nc")
     text = dotted_names()[name].load().__doc__
     example = doctest.DocTestParser().get_doctest(text, {"ep": ep, "np": np}, name, None, None)
-    stated: list[str] = []
-    doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(example, out=stated.append)
-    assert not stated, "".join(stated)
+    failures: list[str] = []
+    doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(example, out=failures.append)
+    assert not failures, "".join(failures)
 
 
 @pytest.mark.slow
@@ -338,8 +338,8 @@ def test_a_docstring_describes_every_parameter() -> None:
             r"^Parameters\n-+\n(.*?)(?=^\w+\n-+\n|\Z)", inspect.getdoc(value), SECTION
         )
         heads = re.findall(r"^(\S.*?) : ", section[1], re.MULTILINE) if section else []
-        stated = {each.lstrip("*") for head in heads for each in head.split(", ")}
-        if missing := set(inspect.signature(value).parameters) - stated:
+        described = {each.lstrip("*") for head in heads for each in head.split(", ")}
+        if missing := set(inspect.signature(value).parameters) - described:
             lost.append(f"{name}: {sorted(missing)}")
     assert not lost, "\n".join(lost)
 

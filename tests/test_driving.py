@@ -156,7 +156,7 @@ T = np.arange(1000) * 0.1
         (np.ones(1000), ""),
     ],
 )
-def test_what_somebody_sets_is_stated_by_its_form(u: np.ndarray, how: str) -> None:
+def test_what_somebody_sets_is_recognised_by_its_form(u: np.ndarray, how: str) -> None:
     assert describe_set(T, u, []) == how
 
 

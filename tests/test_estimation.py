@@ -286,7 +286,7 @@ def test_a_near_miss_of_the_search_is_polished() -> None:
     assert is_right(ep.estimate([run], system.model.library).model, system)
 
 
-def test_prices_count_what_a_term_is_stated_from() -> None:
+def test_penalties_count_what_a_term_is_chosen_from() -> None:
     problem, _ = lorenz_problem()
     names = [problem.library.names[c] for c in problem.column[:10]]
     penalties = dict(zip(names, term_penalties(problem, 100.0)[:10], strict=True))
@@ -345,7 +345,7 @@ def test_samples_that_a_fit_follows_exactly_show_no_noise_of_any_size() -> None:
     assert not shown.any()
 
 
-def test_lasting_noise_is_stated_from_signal_and_buys_no_terms() -> None:
+def test_lasting_noise_is_told_from_signal_and_buys_no_terms() -> None:
     system = ep.lorenz()
     found = ep.estimate([lasting(system.trajectory(), 0.05, 0.7, 0)], system.model.library)
     assert is_right(found.model, system)
@@ -564,8 +564,8 @@ def test_more_coefficients_than_memory_holds_are_refused_first(
     run = many_states(10)
     library = ep.polynomial(run.state_names, degree=3)
     monkeypatch.setattr(cost, "NUMBERS", 50.0)
-    stated = r"2860 coefficients \(286 terms, 10 states\), of which 200 .* 400 samples, would take"
-    with pytest.raises(ValueError, match=stated):
+    message = r"2860 coefficients \(286 terms, 10 states\), of which 200 .* 400 samples, would take"
+    with pytest.raises(ValueError, match=message):
         ep.estimate([run], library)
     run_of_known_terms = {name: ["x0", "x1"] for name in run.state_names}
     cost.check_size([run], library, run_of_known_terms)

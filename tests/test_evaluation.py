@@ -166,7 +166,7 @@ def test_of_several_records_the_worst_run_counts() -> None:
     assert worst_run([run, apart, run]) is apart
 
 
-def test_a_neutral_cycle_is_stated_and_every_start_has_its_own() -> None:
+def test_a_neutral_cycle_is_reported_and_every_start_has_its_own() -> None:
     prey = lotka_volterra()
     found = evaluate(prey.model, prey.trajectory())
     assert found.cycle is not None
@@ -211,7 +211,7 @@ def test_a_run_without_a_cycle_has_none_of_its_numbers() -> None:
     assert re.fullmatch(r"diverges after [0-9.]+ s", diverges.text)
 
 
-def test_of_a_line_of_rest_points_one_is_stated() -> None:
+def test_of_a_line_of_rest_points_one_is_reported() -> None:
     run = record()
     beside = evaluate(model_of({"x": {"y": 1.0}, "y": {"y": -1.0}}), run, n_samples=200)
     (line,) = beside.rest_texts

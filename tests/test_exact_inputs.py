@@ -85,7 +85,7 @@ def test_a_switched_input_is_found_in_noise_and_what_repeats_it_named(degree: in
     found = discover(run, polynomial(run.names, degree=degree), Regression(WeightedWeak()))
     assert set(found.model.terms("x")) == {"x", "u"}
     for term, truth in (("x", -1.0), ("u", 2.0)):
-        # The trapezoidal rule takes a jump for half a step delayed or early: 5 ms in some 1 s.
+        # The trapezoidal rule takes a jump for half a step late or early: 5 ms in some 1 s.
         assert found.model.terms("x")[term] == pytest.approx(truth, rel=0.02)
     messages = [a.message for a in found.ambiguities]
     assert "'u^2' is a multiple of 'u' on every row and is left out" in messages

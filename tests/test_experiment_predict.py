@@ -172,8 +172,8 @@ def test_of_two_cycles_the_law_is_that_of_the_one_with_most_records(tmp_path: Pa
         (0.1 * table).to_csv(tmp_path / f"{a}.csv")
     found = programs.computed(composed(*settings))
     assert found.summary["law"]["cycle"] == "strong"
-    (stated,) = [each for each in found.warnings if "two cycles coexist" in each]
-    assert stated.endswith("a=0.7, a=0.8")
+    (warning,) = [each for each in found.warnings if "two cycles coexist" in each]
+    assert warning.endswith("a=0.7, a=0.8")
     points = found.report.tables["points"].set_index("a")["branch"]
     assert points.to_dict() == {a: "weak" if a in values[2:4] else "strong" for a in values}
     law = OperatingLaw.load(found.folder / "law.json")

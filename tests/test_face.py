@@ -41,7 +41,7 @@ def test_a_mark_is_written_as_it_is_read() -> None:
 
 
 @pytest.mark.parametrize(
-    ("room", "name", "stated"),
+    ("room", "name", "message"),
     [
         (
             "ep2sindy",
@@ -56,8 +56,8 @@ def test_a_mark_is_written_as_it_is_read() -> None:
         ("ep2sindy", "_nothing", r"no attribute '_nothing'; see dir\(ep2sindy\)$"),
     ],
 )
-def test_an_unknown_name_says_where_to_look(room: str, name: str, stated: str) -> None:
-    with pytest.raises(AttributeError, match=stated):
+def test_an_unknown_name_says_where_to_look(room: str, name: str, message: str) -> None:
+    with pytest.raises(AttributeError, match=message):
         getattr(import_module(room), name)
 
 

@@ -151,8 +151,8 @@ def test_an_inspection_of_a_glob_writes_the_list_and_the_command(
 ) -> None:
     swing(here, 0.6, 0.9, 1.2)
     assert not ended("inspect", "a*.csv")
-    stated = capsys.readouterr().out
-    assert "  a=0.6: a0.6.csv\n  a=0.9: a0.9.csv\n  a=1.2: a1.2.csv\n" in stated
-    (line,) = re.findall(r"ep2sindy (\+exp=.*)", stated)  # and no experiment on all as one system
+    printed = capsys.readouterr().out
+    assert "  a=0.6: a0.6.csv\n  a=0.9: a0.9.csv\n  a=1.2: a1.2.csv\n" in printed
+    (line,) = re.findall(r"ep2sindy (\+exp=.*)", printed)  # and no experiment on all as one system
     study = study_of(Study, composed(*map(mend, shlex.split(line))))
     assert list(study.models) == ["free"]

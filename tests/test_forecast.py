@@ -23,13 +23,13 @@ DRIVEN = model_of({"x": {"v": 1.0}, "v": {"x": -1.0, "v": -0.3, "u": 1.0}}, ["u"
 
 
 @cache
-def spring(noise: float, *, momentum_gain: float = 0.0, n: int = 1200, seed: int = 0) -> Trajectory:
+def spring(noise: float, *, process_noise: float = 0.0, n: int = 1200, seed: int = 0) -> Trajectory:
     """The exact spring, at steps of 0.1 s, with process noise of the speed at every step."""
     rng, h = np.random.default_rng(seed), 0.1
     turn = np.array([[np.cos(h), np.sin(h)], [-np.sin(h), np.cos(h)]])
     states = [np.array([1.0, 0.0])]
     for _ in range(n - 1):
-        states.append(turn @ states[-1] + [0.0, momentum_gain * rng.standard_normal()])
+        states.append(turn @ states[-1] + [0.0, process_noise * rng.standard_normal()])
     samples = np.array(states) + noise * rng.standard_normal((n, 2))
     return Trajectory(h * np.arange(n), samples, ("x", "v"))
 
@@ -40,13 +40,13 @@ def few_starts(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys.modules[calibrate.__module__], "N_STARTS", 10)
 
 
-@pytest.mark.parametrize(("noise", "momentum_gain"), [(0.1, 0.0), (0.05, 0.02)])
-def test_noise_and_pushes_are_those_of_the_record(noise, momentum_gain) -> None:
-    estimator = tune_estimator(SPRING, spring(noise, momentum_gain=momentum_gain, n=3000))
+@pytest.mark.parametrize(("noise", "process_noise"), [(0.1, 0.0), (0.05, 0.02)])
+def test_noise_and_process_noise_are_those_of_the_record(noise, process_noise) -> None:
+    estimator = tune_estimator(SPRING, spring(noise, process_noise=process_noise, n=3000))
     # The standard error of either is a hundredth or two of it.
     assert estimator.noise.samples == pytest.approx([noise, noise], rel=0.1)
-    if momentum_gain:
-        assert estimator.noise.process[1] == pytest.approx(momentum_gain, rel=0.15)
+    if process_noise:
+        assert estimator.noise.process[1] == pytest.approx(process_noise, rel=0.15)
     else:
         assert estimator.noise.process.max() < 0.1 * noise
 
@@ -101,12 +101,12 @@ def test_bands_hold_what_they_say(system, noise) -> None:
 
 @pytest.mark.slow
 def test_bands_grow_where_the_record_is_moved_by_process_noise() -> None:
-    run = spring(0.02, momentum_gain=0.05)
+    run = spring(0.02, process_noise=0.05)
     low, high = ep.forecast(SPRING, run, 30.0).band()
     width = (high - low)[:, 0]
     assert width[-20:].mean() > 3.0 * width[:5].mean()
     # Pushes that make the second record grow throughout, by chance, cost it its band.
-    runs = (spring(0.02, momentum_gain=0.05, seed=seed) for seed in (0, 2, 3))
+    runs = (spring(0.02, process_noise=0.05, seed=seed) for seed in (0, 2, 3))
     held = [
         ep.model.forecast_skill(SPRING, run, n_fitted=900, starts=30).coverage_90 for run in runs
     ]
@@ -154,7 +154,7 @@ def test_bands_are_as_wide_as_forecasts_of_the_past_were_off() -> None:
 
 @pytest.mark.slow
 def test_widths_are_the_same_however_often_and_in_what_unit_they_are_asked_for() -> None:
-    run = spring(0.05, momentum_gain=0.02).window(0, 400)
+    run = spring(0.05, process_noise=0.02).window(0, 400)
     once, again = (calibrate(tune_estimator(SPRING, run), run).widths for _ in range(2))
     np.testing.assert_array_equal(once.widths, again.widths)
     scaled = replace(run, states=1e-3 * run.states)
@@ -163,7 +163,7 @@ def test_widths_are_the_same_however_often_and_in_what_unit_they_are_asked_for()
 
 
 @pytest.mark.parametrize("n_groups", [5, 40])
-def test_a_width_is_that_of_a_normal_variable_stated_from_few(n_groups) -> None:
+def test_a_width_is_that_of_a_normal_variable_estimated_from_few(n_groups) -> None:
     """Of groups of starts that share one distance, it holds as many others as it should."""
     rng, held = np.random.default_rng(n_groups), []
     for _ in range(400):
@@ -172,7 +172,7 @@ def test_a_width_is_that_of_a_normal_variable_stated_from_few(n_groups) -> None:
     assert np.mean(held) == pytest.approx(0.9, abs=0.03)
 
 
-def test_no_band_is_shown_where_none_can_be_stated() -> None:
+def test_no_band_is_shown_where_none_can_be_estimated() -> None:
     few = spring(0.05).window(0, 9)
     ahead = ep.forecast(SPRING, few, 1.0)
     assert np.isnan(ahead.band()).all()
@@ -337,7 +337,7 @@ def test_a_history_whose_end_is_at_rest_is_forecast() -> None:
 
 
 @pytest.mark.usefixtures("few_starts")
-def test_the_noise_of_three_samples_is_not_stated() -> None:
+def test_the_noise_of_three_samples_is_not_estimated() -> None:
     few = spring(0.05).window(0, 3)
     with pytest.raises(
         ValueError, match="5 samples or more to tell its noise: got 3; pass the rec"

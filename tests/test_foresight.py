@@ -78,12 +78,12 @@ def test_a_try_that_fails_leaves_the_others() -> None:
 
 def test_what_is_stated_holds_in_the_library_of_every_preparation_that_has_it() -> None:
     states = ep.embed(trace_of(np.sin(np.arange(600) / 6.0)), "derivative")
-    stated = StatedFacts(
+    facts = StatedFacts(
         exclude={"v": ["x^2", "x^5"], "g": ["x"]},
         relations=["v: x == -1 * v: v", "g: x == 1"],
         rests_at_zero=True,
     )
-    library = stated.add_to(states.library(2, ["cos(x)", "sin(x)"]), states)
+    library = facts.add_to(states.library(2, ["cos(x)", "sin(x)"]), states)
     assert set(library.facts.excluded["v"]) == {"x^2", "1", "cos(x)"}
     assert set(library.facts.excluded) == {"v"}
     assert len(library.facts.relations) == len(states.relations) + 1

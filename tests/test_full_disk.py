@@ -41,9 +41,9 @@ def test_no_netcdf_writer_falls_over_on_a_full_disk(tmp_path: Path) -> None:
         [sys.executable, "-c", WRITE], cwd=tmp_path, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
-    stated = done.stdout.splitlines()
-    assert [line.partition(" could")[0] for line in stated] == ["field.nc", "kept.nc"]
-    assert all("File too large" in line and "make room there" in line for line in stated)
+    lines = done.stdout.splitlines()
+    assert [line.partition(" could")[0] for line in lines] == ["field.nc", "kept.nc"]
+    assert all("File too large" in line and "make room there" in line for line in lines)
     assert (tmp_path / "field.nc").read_text() == "earlier"
     assert [path.name for path in tmp_path.iterdir()] == ["field.nc"]
 

@@ -239,8 +239,8 @@ def beside_a_pole(noise: float) -> ep.Trajectory:
     truth = model_of({"x": {"v": 1.0}, "v": {"1/x": 1.0, "x": -1.0, "v": -0.02}})
     clean = truth.simulate(np.arange(0.0, 30.0, 0.05), [2.5, 0.0]).trajectory()
     spread = noise * np.sqrt(np.square(clean.states).mean(axis=0))
-    with_process_noise = spread * np.random.default_rng(0).standard_normal(clean.states.shape)
-    return replace(clean, states=clean.states + with_process_noise)
+    errors = spread * np.random.default_rng(0).standard_normal(clean.states.shape)
+    return replace(clean, states=clean.states + errors)
 
 
 def test_noise_that_carries_samples_past_a_pole_hides_no_law() -> None:

@@ -177,8 +177,8 @@ def test_equal_lengths_are_asked_not_guessed(tmp_path: Path) -> None:
     np.savez(tmp_path / "a.npz", t=T, z=Z, r=R[0] + Z, ni=square, I_d=WAVE[:, 0, 0])
     found = recognise(open_source(tmp_path / "a.npz"), plasma=True)
     assert "n_i" not in found.variables
-    stated = "'ni' of shape (40, 7, 7) may be [time,z,r] or [time,r,z]"
-    assert any(stated in question for question in found.questions)
+    wanted = "'ni' of shape (40, 7, 7) may be [time,z,r] or [time,r,z]"
+    assert any(wanted in question for question in found.questions)
 
 
 def test_two_names_for_one_quantity_are_asked(tmp_path: Path) -> None:
@@ -226,7 +226,7 @@ def test_plain_columns_in_json_are_a_record(tmp_path: Path) -> None:
     assert field["I_d"].attrs["units"] == "A"
 
 
-def test_all_that_is_wrong_with_a_mapping_is_stated_at_once(tmp_path: Path) -> None:
+def test_all_that_is_wrong_with_a_mapping_is_reported_at_once(tmp_path: Path) -> None:
     np.savez(tmp_path / "a.npz", t=T, z=Z, ni=N_I[:, :, 0], Te=T_E[:10, :, 0])
     wrong = {"n_i": ("nii", "m^-3"), "u_iz": ("ni", "kg"), "T_e_eV": ("Te", "eV")}
     with pytest.raises(ValueError, match="3 things must be put right"):

@@ -236,13 +236,13 @@ def test_process_noise_may_keep_up_what_would_die_out() -> None:
     law = {"x": {"y": 1.0}, "y": {"x": -1.0, "y": -0.2}}
     fit, small = on_a_circle(law), np.full(2, 1e-5)
     # The variance of a damped oscillator under noise: q^2 / (2 * 0.1) per unit of time, about one.
-    with_process_noise = np.full(2, np.sqrt(0.2 * 0.3))
-    assert try_open_loop(fit, np.full(2, 0.01), with_process_noise, start=small).passes.all()
+    process_noise = np.full(2, np.sqrt(0.2 * 0.3))
+    assert try_open_loop(fit, np.full(2, 0.01), process_noise, start=small).passes.all()
 
 
 def test_a_delay_is_stated_with_its_error() -> None:
     run = spoilt("lotka_volterra", "lag 2", 0, 0.02)[1]
     found = ep.estimate([run], ep.polynomial(["x", "y"], degree=2))
-    stated = re.search(r"y lags by \S+ s \((\S+) ± (\S+) samples\)", found.lack_of_fit)
-    assert stated is not None
-    assert abs(float(stated[1]) - 2.0) < 2.0 * float(stated[2])
+    match = re.search(r"y lags by \S+ s \((\S+) ± (\S+) samples\)", found.lack_of_fit)
+    assert match is not None
+    assert abs(float(match[1]) - 2.0) < 2.0 * float(match[2])

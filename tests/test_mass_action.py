@@ -53,7 +53,7 @@ def test_other_functions_and_inputs_prove_nothing() -> None:
     turning = ep.SparseModel(library, ["x"], np.array([[0.0], [-1.0], [0.5]]), {"x": "1"})
     assert consequences(turning) == []
     driven = ep.polynomial(["x", "u"], degree=1)
-    with_process_noise = ep.SparseModel(
+    with_input = ep.SparseModel(
         driven, ["x"], np.array([[0.0], [-1.0], [0.5]]), {"x": "1", "u": "1"}
     )
-    assert consequences(with_process_noise) == []
+    assert consequences(with_input) == []

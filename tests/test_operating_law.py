@@ -271,7 +271,7 @@ def test_relations_that_hold_save_numbers_and_others_cost_errors() -> None:
     assert max(errors["free"], errors["held"]) < 1e-2 * min(errors["wrong"], errors["fewer"])
 
 
-def test_of_errors_that_cannot_be_stated_apart_the_fewest_numbers_are_chosen() -> None:
+def test_of_errors_that_cannot_be_told_apart_the_fewest_numbers_are_chosen() -> None:
     rng = np.random.default_rng(0)
     least = 1.0 + 0.1 * rng.normal(size=9)
     same, worse = least + 0.05 * (-1.0) ** np.arange(9) + 0.003, least + 0.3
@@ -352,7 +352,7 @@ def amplitudes(factors: Mapping[int, float]) -> list[OperatingRecord]:
     ]
 
 
-def test_records_of_a_second_cycle_are_stated_apart() -> None:
+def test_records_of_a_second_cycle_are_told_apart() -> None:
     assert not branches_of(amplitudes({})).any()
     assert np.flatnonzero(branches_of(amplitudes({4: 0.2}))).tolist() == [4]
     assert np.flatnonzero(branches_of(amplitudes({1: 0.3, 5: 0.2, 6: 0.1}))).tolist() == [1, 5, 6]

@@ -1,4 +1,4 @@
-"""A file of one's own on the command line: looked into, written down, run, and stated."""
+"""A file of one's own on the command line: looked into, written down, run, and reported."""
 
 import json
 import warnings
@@ -41,9 +41,9 @@ def test_two_commands_lead_from_a_file_to_its_equations(
 ) -> None:
     lorenz_csv(folder / "scope.csv", lost=5)
     assert not ended("inspect", "scope.csv", "--write")
-    stated = capsys.readouterr().out
+    printed = capsys.readouterr().out
     command = "ep2sindy +exp=discover data=scope 'trajectory.states=[x,y,z]'"
-    assert command in stated
+    assert command in printed
     rest = ["trajectory.states=[x,y,z]", "search=best_subset", "selection=ebic", "forecasts=0"]
     assert not ended("+exp=discover", "data=scope", *rest)
     (run,) = (folder / "outputs" / "discover").iterdir()
@@ -105,7 +105,7 @@ def test_a_gap_leaves_the_step_as_it_is(folder: Path, capsys: pytest.CaptureFixt
 
 
 @pytest.mark.parametrize(
-    ("header", "times", "dt_s", "stated_s"),
+    ("header", "times", "dt_s", "given_s"),
     [
         ("t (ms)", 20.0 * np.arange(50), 1.0, "0.02"),
         ("t", 20.0 * np.arange(50), 0.02, ""),  # ms, which dt_s says
@@ -113,19 +113,19 @@ def test_a_gap_leaves_the_step_as_it_is(folder: Path, capsys: pytest.CaptureFixt
         ("t (s)", 0.01 * np.r_[0:25, 100:125], 0.01, ""),  # with a gap
     ],
 )
-def test_a_step_that_contradicts_the_files_times_is_stated(
-    folder: Path, header: str, times: np.ndarray, dt_s: float, stated_s: str
+def test_a_step_that_contradicts_the_files_times_is_reported(
+    folder: Path, header: str, times: np.ndarray, dt_s: float, given_s: str
 ) -> None:
     rows = "\n".join(f"{t:.9g},{k % 7}" for k, t in enumerate(times))
     (folder / "a.csv").write_text(f"{header},V\n{rows}\n")
-    with warnings.catch_warnings(record=True) as stated:
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         field = ep.open_field("a.csv", dt_s=dt_s)
     assert field.time[1] == dt_s  # taken in any case
-    texts = [str(each.message) for each in stated if each.category is DoubtfulUnit]
-    assert len(texts) == bool(stated_s)
+    texts = [str(each.message) for each in caught if each.category is DoubtfulUnit]
+    assert len(texts) == bool(given_s)
     for text in texts:
-        assert f"'t', which go in steps of {stated_s} s" in text
+        assert f"'t', which go in steps of {given_s} s" in text
 
 
 WAVE = np.outer(np.arange(1.0, 6.0), np.arange(1.0, 11.0))

@@ -64,27 +64,27 @@ def test_every_piece_is_done_once_and_keeps_its_number(workers: Workers) -> None
 
 
 def test_rows_come_in_the_order_of_their_pieces() -> None:
-    stated: list[int] = []
-    rows = rows_in_order(Backwards(), repeated, [3, 0, 2], "piece", as_progress(stated.append))
+    advances: list[int] = []
+    rows = rows_in_order(Backwards(), repeated, [3, 0, 2], "piece", as_progress(advances.append))
     assert rows == [3, 3, 3, 2, 2]
-    assert stated == [1, 1, 1]
+    assert advances == [1, 1, 1]
     with pytest.raises(ValueError, match="there must be something to run, got 1 pieces"):
         rows_in_order(Serial(), repeated, [0], "piece")
 
 
-def test_results_come_in_the_order_of_their_pieces_and_are_stated_as_they_come() -> None:
+def test_results_come_in_the_order_of_their_pieces_and_are_told_as_they_come() -> None:
     advanced: list[int] = []
-    stated: list[tuple[int, list[int]]] = []
+    told: list[tuple[int, list[int]]] = []
     results = collect(
         Backwards(),
         repeated,
         [3, 0, 2],
         nullcontext(advanced.append),
         size=lambda piece: 10 * piece,
-        tell=lambda number, result: stated.append((number, result)),
+        tell=lambda number, result: told.append((number, result)),
     )
     assert results == [[3, 3, 3], [], [2, 2]]
-    assert stated == [(2, [2, 2]), (1, []), (0, [3, 3, 3])]
+    assert told == [(2, [2, 2]), (1, []), (0, [3, 3, 3])]
     assert advanced == [20, 0, 30]
 
 
@@ -238,7 +238,7 @@ WORK = {"waiting": ("", "signal.pause()"), "computing": (COMPILED.strip(), COMPU
     ],
 )
 def test_workers_end_with_their_run(tmp_path: Path, name: str, work: str) -> None:
-    """A worker is in its work when it next looks at its parent: it has stated so just before."""
+    """A worker is in its work when it next looks at its parent: it has said so just before."""
     preparation, endless = WORK[work]
     script = tmp_path / "run.py"
     script.write_text(KILLED.replace("PREPARATION", preparation).replace("WORK", endless))
@@ -256,6 +256,6 @@ def test_workers_end_with_their_run(tmp_path: Path, name: str, work: str) -> Non
         _, alive = psutil.wait_procs(workers, timeout=PATIENCE_S)
         for each in alive:
             each.kill()
-        stated = run.stdout.read()
+        printed = run.stdout.read()
     assert not alive
-    assert stated == ("" if name == "SIGKILL" else f"interrupted by {name}\n")
+    assert printed == ("" if name == "SIGKILL" else f"interrupted by {name}\n")

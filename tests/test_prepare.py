@@ -152,14 +152,14 @@ def test_a_condition_must_compare_places(condition: str) -> None:
         keep_where(grid(), condition=condition)
 
 
-def precompile() -> xr.Dataset:
+def plasma() -> xr.Dataset:
     T = np.outer(np.linspace(1.0, 2.0, N), [5.0, 10.0, np.nan])
     return field(T_e_eV=(("time", "z"), T, "eV"))
 
 
 def test_the_rate_comes_from_the_fits() -> None:
-    after = ionization_rate(precompile())
-    expected = propellants.ionization_rate(precompile()["T_e_eV"].values[:, :2])
+    after = ionization_rate(plasma())
+    expected = propellants.ionization_rate(plasma()["T_e_eV"].values[:, :2])
     assert np.array_equal(after["R_ion"].values[:, :2], expected)
     assert np.isnan(after["R_ion"].values[:, 2]).all()
     assert after["R_ion"].attrs == {"units": "m^3/s"}
@@ -172,8 +172,8 @@ TABLE = (
 
 def test_the_rate_comes_from_a_table(tmp_path: Path) -> None:
     (tmp_path / "rates.csv").write_text(TABLE)
-    after = ionization_rate(precompile(), table=tmp_path / "rates.csv")
-    expected = 2e-14 + 2e-15 * (precompile()["T_e_eV"].values - 5.0)
+    after = ionization_rate(plasma(), table=tmp_path / "rates.csv")
+    expected = 2e-14 + 2e-15 * (plasma()["T_e_eV"].values - 5.0)
     assert after["R_ion"].values[:, :2] == pytest.approx(expected[:, :2], rel=1e-12)
     assert np.isnan(after["R_ion"].values[:, 2]).all()
 
@@ -215,8 +215,8 @@ def test_radial_velocity_counts_from_mid_radius(
 
 @pytest.mark.parametrize("gas", ["krypton", "argon"])
 def test_other_gases_have_rates_of_their_own(gas: str) -> None:
-    after = ionization_rate(precompile(), gas=gas)
-    T = precompile()["T_e_eV"].values
+    after = ionization_rate(plasma(), gas=gas)
+    T = plasma()["T_e_eV"].values
     known = propellant(gas)
     expected = np.interp(T, known.T_e_eV, known.ionization_rate)
     np.testing.assert_array_equal(after["R_ion"].values[np.isfinite(T)], expected[np.isfinite(T)])
@@ -224,12 +224,12 @@ def test_other_gases_have_rates_of_their_own(gas: str) -> None:
 
 
 def test_a_gas_has_its_range_and_its_own_table(tmp_path: Path) -> None:
-    hot = precompile()
+    hot = plasma()
     hot["T_e_eV"] *= 20
     with pytest.raises(ValueError, match="T_e_eV must stay in the rate table, 0 to 100 eV"):
         ionization_rate(hot, gas="krypton")
     with pytest.raises(ValueError, match="got gas='argon' next to"):
-        ionization_rate(precompile(), gas="argon", table=tmp_path / "rates.csv")
+        ionization_rate(plasma(), gas="argon", table=tmp_path / "rates.csv")
 
 
 Z_UNEVEN = np.array([0.0, 1.0, 3.0, 3.5])

@@ -91,8 +91,8 @@ def test_what_a_library_lacks_is_no_process_noise(noise: float) -> None:
     assert not found.fits
 
 
-@pytest.mark.slow  # an equation without one of its states is stated so in the fast suite
-def test_an_equation_that_lacks_no_term_is_stated_from_one_that_does() -> None:
+@pytest.mark.slow  # an equation without one of its states is told so in the fast suite
+def test_an_equation_that_lacks_no_term_is_told_from_one_that_does() -> None:
     """x' lacks x^3, and the linear y' is right."""
     run = VAN_DER_POL.trajectory(noise=0.05, rng=0)
     found = ep.estimate(run, ep.polynomial(run.state_names, degree=2))

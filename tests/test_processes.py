@@ -29,7 +29,7 @@ LAW = {
 
 
 def held_by(roles: ep.Roles):
-    return constraint_of(LIBRARY, STATES, roles.processes(LIBRARY, STATES), roles.stated)
+    return constraint_of(LIBRARY, STATES, roles.processes(LIBRARY, STATES), roles.known_processes)
 
 
 def texts(roles: ep.Roles, coef, **options) -> list[str]:
@@ -90,7 +90,7 @@ def test_a_small_zone_gives_a_large_one_less() -> None:
     chosen = {}
     for process in roles.processes(library, names):
         chosen.setdefault(process.role, process)
-    held = constraint_of(library, names, [*chosen.values()], roles.stated)
+    held = constraint_of(library, names, [*chosen.values()], roles.known_processes)
     free = [held.coefficients[k][0] for k in held.free]
     coef = held.coef(np.array([1.0 if state.startswith("n_i") else -1.0 for state in free]))
     given = {s: {} for s in names}

@@ -104,8 +104,8 @@ def test_a_config_tells_roles(tmp_path):
         "+exp=discover", "data=recognised", f"data.path={tmp_path / 'run.csv'}",
         "trajectory.states=[A,B,C]", "forecasts=0", f"output={tmp_path}",
     )  # fmt: skip
-    stated = "roles={_target_: ep2sindy.Roles, exchange: [['A + B', C]], nonnegative: true}"
-    found = programs.computed(programs.composed(*given, stated))
+    roles = "roles={_target_: ep2sindy.Roles, exchange: [['A + B', C]], nonnegative: true}"
+    found = programs.computed(programs.composed(*given, roles))
     terms = found.summary["models"]["model"]["equations"]
     assert terms["A"] == pytest.approx(terms["B"])
     assert terms["A"] == pytest.approx({term: -coef for term, coef in terms["C"].items()})

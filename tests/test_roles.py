@@ -64,7 +64,7 @@ def test_what_leaves_one_volume_fills_another_by_the_ratio_of_their_sizes():
 
 def test_the_constraint_is_that_of_the_processes():
     chosen = processes(("n_n to n_i", "n_i*n_n"), ("n_n to n_i", "n_i"), ("n_i out", "n_i"))
-    held = constraint_of(LIBRARY, STATES, chosen, ep.Roles(inflow={"n_n": 7.0}).stated)
+    held = constraint_of(LIBRARY, STATES, chosen, ep.Roles(inflow={"n_n": 7.0}).known_processes)
     assert held.coefficients == (
         ("n_i", "n_i"), ("n_i", "n_i*n_n"), ("n_n", "1"), ("n_n", "n_i"), ("n_n", "n_i*n_n"),
     )  # fmt: skip
@@ -177,14 +177,14 @@ def amounts_of(found) -> list:
 
 def test_what_is_stated_is_kept_next_to_what_is_found(record):
     """n_n leaves by S + B, stated as an outflow and a seed: only the seed is to be found."""
-    stated = {"n_n out": {"n_n": B}, "n_n in": {"1": M}, "n_i out": {"n_i": A}}
+    known = {"n_n out": {"n_n": B}, "n_n in": {"1": M}, "n_i out": {"n_i": A}}
     roles = ep.Roles(
         exchange=[("n_n", "n_i")], outflow={"n_n": "known", "n_i": "known or free"},
         inflow={"n_n": "known"}, nonnegative=True,
     )  # fmt: skip
     assert roles.open == ["n_n out", "n_i out", "n_n in"]
     method = refined(3)
-    found = ep.discover(record, LIBRARY.with_roles(roles.with_known(stated)), method)
+    found = ep.discover(record, LIBRARY.with_roles(roles.with_known(known)), method)
     assert {(p.role, p.term) for p in found.constraint.processes} == {
         ("n_n to n_i", "n_n"), ("n_n to n_i", "n_i*n_n")
     }  # fmt: skip
@@ -245,7 +245,7 @@ def test_a_known_equation_is_kept_and_its_terms_stand_in_no_other() -> None:
     assert whole.names == (*library.names, "n_i^2*n_n")
     processes = roles.processes(library, STATES)
     assert [(p.role, p.term) for p in processes] == [("n_i out", "n_i"), ("n_i out", "n_i^2")]
-    held = constraint_of(whole, STATES, processes[:1], roles.stated)
+    held = constraint_of(whole, STATES, processes[:1], roles.known_processes)
     assert held.coefficients == (("n_i", "n_i"), ("n_n", "1"), ("n_n", "n_i^2*n_n"))
     assert held.coef(np.array([-5.0])).tolist() == [-5.0, -1.0, 2.0]
 

@@ -139,6 +139,6 @@ def test_a_column_that_says_nothing_new_is_in_no_candidate(
 def test_a_number_that_is_none_is_named(exact: Rows, row: int, column: int, value: float) -> None:
     theta = exact.theta.copy()
     theta[row, column] = value
-    stated = f"'{NAMES[column]}' is not on row {row}"
-    with pytest.raises(ValueError, match=stated):
+    message = f"'{NAMES[column]}' is not on row {row}"
+    with pytest.raises(ValueError, match=message):
         Rows(theta, exact.target, exact.coef).problem()

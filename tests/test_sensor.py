@@ -81,10 +81,10 @@ def test_residuals_next_to_limits_are_the_slope_of_what_is_least() -> None:
     here = observe(record, path, variance)
     up, down = (observe(record, path + sign * small, variance).squares for sign in (1.0, -1.0))
     slope = np.nan_to_num(-2.0 * here.residuals / here.variance)
-    stated = np.isfinite(here.residuals)
-    assert 0 < (stated & record.limits.at).sum() < record.limits.at.sum()
+    known = np.isfinite(here.residuals)
+    assert 0 < (known & record.limits.at).sum() < record.limits.at.sum()
     np.testing.assert_allclose(
-        slope[stated], ((up - down) / (2 * small))[stated], rtol=1e-4, atol=1e-5
+        slope[known], ((up - down) / (2 * small))[known], rtol=1e-4, atol=1e-5
     )
 
 
@@ -240,7 +240,7 @@ def test_the_first_channel_may_be_the_late_one() -> None:
     ("kind", "word"),
     [("outliers", "outliers beyond five"), ("multiplicative", "grows with"), ("AR 0.95", "lasts")],
 )
-def test_noise_that_is_not_as_assumed_is_stated(kind: str, word: str) -> None:
+def test_noise_that_is_not_as_assumed_is_reported(kind: str, word: str) -> None:
     system, run = spoilt("lotka_volterra", kind, 0, 0.02)
     found = ep.discover(run, system.model.library)
     assert any(word in each for each in found.data_warnings)
@@ -262,9 +262,9 @@ def test_white_and_normal_noise_is_not_spoken_of(name: str) -> None:
 def test_a_state_that_is_another_one_is_refused() -> None:
     run = ep.lotka_volterra().trajectory(noise=0.02, rng=0)
     x, y = run.states.T
-    for third, stated in ((x, "z is 1 x at"), (1.0 - 2.0 * y, r"z is -2 y \+1 at")):
+    for third, words in ((x, "z is 1 x at"), (1.0 - 2.0 * y, r"z is -2 y \+1 at")):
         twice = ep.Trajectory(run.t, np.column_stack([x, y, third]), ["x", "y", "z"])
-        with pytest.raises(ValueError, match=f"states must differ: {stated}.*leave z out"):
+        with pytest.raises(ValueError, match=f"states must differ: {words}.*leave z out"):
             ep.discover(twice)
     nearly = ep.Trajectory(run.t, np.column_stack([x, y, x + 1e-4 * y]), ["x", "y", "z"])
     check_repeats([nearly])

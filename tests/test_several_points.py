@@ -169,8 +169,8 @@ def test_a_term_that_some_points_cannot_show_is_found() -> None:
     assert models["p=3"] == pytest.approx({"a": 2.0, "b": -0.5}, abs=0.05)
     assert models["p=1"]["b"] == pytest.approx(0.0, abs=0.05)
     assert list(models["p=2"]) == ["a"]
-    (stated,) = found.points["p=2"].ambiguities
-    assert stated.message == "'b' is zero on every row and is left out"
+    (ambiguity,) = found.points["p=2"].ambiguities
+    assert ambiguity.message == "'b' is zero on every row and is left out"
     assert found.points["p=3"].ambiguities == ()
     for p in (1.0, 2.0):
         assert terms_in(searched({p: rows[p]})) == ("a",)
@@ -184,7 +184,7 @@ def test_terms_taken_in_by_chance_at_single_points_are_dropped() -> None:
     assert terms_in(searched(rows, selection=BIC)) == ("a", "b", "c")
 
 
-def test_terms_that_repeat_each_other_at_one_point_are_stated_apart_by_another() -> None:
+def test_terms_that_repeat_each_other_at_one_point_are_told_apart_by_another() -> None:
     rows = {p: rows_of({"b": 1.0}, seed=k, noise=0.1) for k, p in enumerate((1.0, 2.0))}
     alike = rows[1.0].theta.copy()
     alike[:, 0] = 3.0 * alike[:, 1]
@@ -329,8 +329,8 @@ def test_the_functions_of_a_law_are_found(bend: Mapping[str, str], functions: se
     assert set(law.functions.names) >= functions
     if bend:
         assert set(law.functions.names) == functions
-        stated = searched(rows, law=[1, ep.named_terms(["p"], sorted(functions))]).law
-        assert set(stated.functions.names) == functions
+        given = searched(rows, law=[1, ep.named_terms(["p"], sorted(functions))]).law
+        assert set(given.functions.names) == functions
     one = searched(rows, law=[1, 2, 3]).law
     assert len(one.functions) == {"1/p": 4, "p^2": 3}.get(bend.get("b", ""), 2)
     straight = searched(rows, law=1).law.left_out

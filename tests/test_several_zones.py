@@ -11,8 +11,8 @@ from ep2sindy.data.sampling import ZoneAverage, side_by_side
 from ep2sindy.library.equations import equation_html, latex_derivative, latex_term_name
 from ep2sindy.library.names import check_state
 from ep2sindy.library.relations import parse_relation
-from ep2sindy.library.roles import constraint_of, fractions_of
-from ep2sindy.studies.processes import Zones, compared_processes, stated_roles
+from ep2sindy.library.roles import constraint_of, process_matrix
+from ep2sindy.studies.processes import Zones, compared_processes, fit_roles
 from tests.models import model_of
 from tests.programs import composed, computed
 
@@ -191,16 +191,16 @@ def test_processes_of_zones_stand_next_to_what_the_record_exchanged(field, zones
     balances = {name: ep.thruster.zone_balance(field, zone) for name, zone in parts.items()}
     sizes = ZoneAverage(STATES, zones=zones).sizes(field)
     roles = ROLES.in_zones(sizes).with_known(
-        {k: dict(v.terms) for k, v in stated_roles(balances, run).items()}
+        {k: dict(v.terms) for k, v in fit_roles(balances, run).items()}
     )
     library = ep.polynomial(run.state_names, degree=3)
     chosen = {p.role: p for p in roles.processes(library, run.state_names)}  # the last of each
-    held = constraint_of(library, run.state_names, [*chosen.values()], roles.stated)
+    held = constraint_of(library, run.state_names, [*chosen.values()], roles.known_processes)
     assert held is not None
     rates = 1e23 * np.arange(1.0, 7.0)
     theta = library.evaluate(run.states)
     means = [theta[:, library.index(p.term)].mean() for p in chosen.values()]
-    values = held.coef(fractions_of(held) @ (rates / means))
+    values = held.coef(process_matrix(held) @ (rates / means))
     coef = np.zeros((len(library), 4))
     for (state, term), value in zip(held.coefficients, values, strict=True):
         coef[library.index(term), run.state_names.index(state)] = value

@@ -29,7 +29,7 @@ def errors(size: float | np.ndarray, *, seed: int = 0, n: int = 40) -> np.ndarra
     return size * (1.0 + 0.1 * rng.standard_normal((n, N_HORIZONS)))
 
 
-def test_a_gain_at_all_horizons_is_stated() -> None:
+def test_a_gain_at_all_horizons_is_reported() -> None:
     found = skill(model=errors(0.1), autoregression=errors(0.3, seed=1))
     assert found.text == "better than an autoregression (AR 3) for 2 periods and more"
     assert found.headline == f"a model that forecasts {found.text}"
@@ -58,7 +58,7 @@ def test_one_start_or_equal_errors_tell_nothing() -> None:
 
 @pytest.mark.parametrize("overlap", [1, 5, 10])
 def test_correlated_starts_are_allowed_for(overlap) -> None:
-    """Overlapping forecasts fraction what moves them. Without a gain, chance exceeds its standard
+    """Overlapping forecasts share what moves them. Without a gain, chance exceeds its standard
     error in one case of six, and is sure in one of twenty.
     """
     rng, n, n_cases = np.random.default_rng(overlap), 40, 1000

@@ -15,9 +15,9 @@ TABLE = pd.DataFrame({"Time (us)": 1e6 * T, "I_d [mA]": X, "note": ["ok"] * len(
 
 
 def write_tdms(path: Path) -> None:
-    stated = {"wf_increment": 1.5e-6, "unit_string": "mA"}
+    properties = {"wf_increment": 1.5e-6, "unit_string": "mA"}
     with TdmsWriter(path) as writer:
-        writer.write_segment([ChannelObject("Probes", "I_d", X, properties=stated)])
+        writer.write_segment([ChannelObject("Probes", "I_d", X, properties=properties)])
 
 
 def write_tdms_of_named_units(path: Path) -> None:

@@ -68,7 +68,7 @@ LAYOUTS = {
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_layouts_are_stated_from_their_content(tmp_path: Path, layout: str, encoding: str) -> None:
+def test_layouts_are_told_from_their_content(tmp_path: Path, layout: str, encoding: str) -> None:
     text, names, units, factor = LAYOUTS[layout]
     (tmp_path / "a.txt").write_text(text, encoding=encoding)
     source = open_source(tmp_path / "a.txt")

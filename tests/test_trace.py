@@ -142,7 +142,7 @@ def test_what_is_faster_than_asked_counts_as_noise():
     assert np.abs(fine.run.states[20:-20, 0] - clean.states[20:-20, 0]).max() < 0.03
 
 
-def test_fine_samples_are_averaged_unless_stated_not_to():
+def test_fine_samples_are_averaged_unless_told_not_to():
     fine = sine(10.0, per_period=1000)
     kept = ep.signals.prepare_signal(fine, decimate=None)
     assert len(kept.x) == fine.n_samples

@@ -80,7 +80,7 @@ class Parsed(HTMLParser):
     def __init__(self, page: str) -> None:
         super().__init__()
         self.tags: list[str] = []
-        self.stated = ""
+        self.text = ""
         self.feed(page)
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
@@ -88,7 +88,7 @@ class Parsed(HTMLParser):
             self.tags += [tag, *(name for name, _ in attrs)]
 
     def handle_data(self, data: str) -> None:
-        self.stated += data
+        self.text += data
 
 
 @pytest.mark.parametrize("text", MARKUP)
@@ -111,5 +111,5 @@ def test_page_and_screen_show_markup_as_it_is(text: str, tmp_path: Path) -> None
 
     found = Parsed(page(text))
     assert text in (tmp_path / "run.log").read_text()
-    assert found.stated.count(text) >= 19
+    assert found.text.count(text) >= 19
     assert found.tags == Parsed(page("w" * len(text))).tags

@@ -11,11 +11,11 @@ from ep2sindy.studies.source import DivergedError, Step, amiss, is_simulation, o
 
 
 def simulation(status: str, n_samples: int = 2000) -> xr.Dataset:
-    stated = {"status": status, "I_d_mean": 1.0, "I_d_std": 0.0, "parameters": "{}", "f_kHz": 80.0}
+    attrs = {"status": status, "I_d_mean": 1.0, "I_d_std": 0.0, "parameters": "{}", "f_kHz": 80.0}
     time_s, z = 1e-6 * np.arange(n_samples), np.array([0.01, 0.02])
     n_i = 1e17 + 1e16 * np.random.default_rng(0).random((n_samples, 2))
     data = {"n_i": (("time", "z"), n_i, {"units": "m^-3"})}
-    return xr.Dataset(data, coords={"time": time_s, "z": z}, attrs=stated)
+    return xr.Dataset(data, coords={"time": time_s, "z": z}, attrs=attrs)
 
 
 def prepared(field: xr.Dataset, *steps: Step) -> xr.Dataset:

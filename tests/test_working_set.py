@@ -184,9 +184,9 @@ def test_small_libraries_are_weighed_whole() -> None:
 def exact_gains(pair: Gram, support: np.ndarray) -> np.ndarray:
     """Fall of the quadratic function of all coefficients by each one next to a support."""
     inverse = invert_gram(pair.quadratic[np.ix_(support, support)])
-    fraction = pair.quadratic[:, support] @ inverse
-    own = np.diag(pair.quadratic) - np.einsum("js,js->j", fraction, pair.quadratic[:, support])
-    score = pair.linear - fraction @ pair.linear[support]
+    projection = pair.quadratic[:, support] @ inverse
+    own = np.diag(pair.quadratic) - np.einsum("js,js->j", projection, pair.quadratic[:, support])
+    score = pair.linear - projection @ pair.linear[support]
     return np.where(support, 0.0, np.square(score) / np.where(support, 1.0, own))
 
 
@@ -293,5 +293,5 @@ def test_products_do_not_stand_in_for_linear_terms_of_a_transient(noise: float, 
     found = ep.estimate(run, library)
     assert not found.model.coef[library.degrees > 1].any()
     right = ((found.model.coef[1:7].T != 0.0) == (matrix != 0.0)).all()
-    # Six decaying states of one transient look alike: where terms are wrong, it is stated.
+    # Six decaying states of one transient look alike: where terms are wrong, it is said.
     assert right or "samples do not tell these equations from others" in found.too_few_samples

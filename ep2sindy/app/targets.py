@@ -41,9 +41,8 @@ def _own(name: str, place: str) -> Callable[..., Any]:
         return load_marked(name)
     except (ModuleNotFoundError, AttributeError, ValueError) as error:
         raise ValueError(
-            f"{place} must name a _target_ of ep2sindy that is for configs, such as "
-            f"ep2sindy.EBIC, or one of yours below the folder that you start in: got {name!r}, "
-            f"and {error}"
+            f"{place} must name a _target_ of ep2sindy that is for configs, such as ep2sindy.EBIC, "
+            f"or one of yours below the folder that you start in: got {name!r}, and {error}"
         ) from error
 
 

@@ -236,8 +236,8 @@ class DiscoveryProblem:
             known[0, [library.index(name) for name in facts.only[equation]]] = True
             return [known] * len(found)
         # At another point a coefficient may be another number than zero: its term is in.
-        stated = [Relation(((1.0, *place),), 1.0, "") for place in facts.known_factors]
-        relations = [*facts.relations, *stated]
+        ones = [Relation(((1.0, *place),), 1.0, "") for place in facts.known_factors]
+        relations = [*facts.relations, *ones]
         return [complete(masks, library, equation, relations) for masks in found]
 
     def _check_hidden(self) -> None:

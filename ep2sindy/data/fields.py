@@ -125,10 +125,9 @@ def check_samples(
             if axis in array.dims
         )
         raise ValueError(
-            f"samples must be finite, or NaN at all times where there is no plasma: "
-            f"{array.name} = {value:.6g}{' after NaN' if np.isfinite(value) else ''} at {place} "
-            f"({len(bad)} such values); "
-            "crop, mask or interpolate them first"
+            f"samples must be finite, or NaN at all times where there is no plasma: {array.name} = "
+            f"{value:.6g}{' after NaN' if np.isfinite(value) else ''} at {place} ({len(bad)} such "
+            "values); crop, mask or interpolate them first"
         )
 
 

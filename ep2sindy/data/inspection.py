@@ -194,9 +194,9 @@ class Inspection:
             step = f", {about}{one.step:.4g} apart" if one.step else ""
             role = ", ".join(self._roles.get(one.name, ["-"])) + step
             span = [f"{one.low:.4g}", f"{one.high:.4g}", str(one.n_missing or "")]
-            stated = [f"({', '.join(map(str, one.shape))})", one.unit, *span, role]
+            cells = [f"({', '.join(map(str, one.shape))})", one.unit, *span, role]
             unused = [*[""] * 5, TEXT if one.problem == TEXT else "left out"]
-            rows.append([one.name, *(unused if one.problem else stated)])
+            rows.append([one.name, *(unused if one.problem else cells)])
         return rows
 
     @cached_property

@@ -226,7 +226,7 @@ def describe_array(source: FileSource, name: str) -> ArrayInfo:
         reason = str(error).removeprefix(f"{source.path} cannot be read: ")
         return ArrayInfo(name, problem=TEXT if "real numbers" in reason else reason)
     attribute = str(array.attrs.get("units", "") or source.units.get(name, ""))
-    stated = counted_in(attribute) if attribute else unit_in_brackets(name)
+    unit = counted_in(attribute) if attribute else unit_in_brackets(name)
     dims = tuple(map(str, array.dims)) if source.dims_named else ()
     is_vector = array.size in array.shape
     points = np.asarray(array.values, dtype=np.float64).ravel() if is_vector else np.empty(0)
@@ -235,7 +235,7 @@ def describe_array(source: FileSource, name: str) -> ArrayInfo:
     falls = _fall(points, steps)
     steps = steps if steps.size > 1 and not falls else np.empty(0)
     return ArrayInfo(
-        name, array.shape, stated, dims, low, high, n_missing,
+        name, array.shape, unit, dims, low, high, n_missing,
         int(array.attrs.get(N_MARKS, 0)),
         float(np.median(steps)) if steps.size else None,
         bool(steps.size and np.ptp(steps) <= 1e-3 * steps.mean()),

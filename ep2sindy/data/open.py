@@ -116,12 +116,12 @@ def open_field(
         field = _field(source, variables, axes, dt_s, mask, chunks, problems)
     if doubt := _step_doubt(source, times, field, dt_s):
         warnings.warn(doubt, DoubtfulUnit, stacklevel=2)
-    stated = {
+    attrs = {
         "channel_m": channel_m or source.channel_m,
         "file": str(source.path),
         STEP_DOUBT: doubt,
     }
-    return field.assign_attrs({name: value for name, value in stated.items() if value})
+    return field.assign_attrs({name: value for name, value in attrs.items() if value})
 
 
 def inspect_file(path: str | Path | Sequence[str | Path], *, plasma: bool = False) -> Inspection:
@@ -201,8 +201,8 @@ def _field(
         with problems.noted():
             arrays[ours] = read_array(source, ours, str(variable.name))
         with problems.noted():
-            stated = arrays[ours].attrs if ours in arrays else {}
-            to_si(xr.DataArray(0.0, attrs=stated), ours, variable.unit, is_variable=True)
+            attrs = arrays[ours].attrs if ours in arrays else {}
+            to_si(xr.DataArray(0.0, attrs=attrs), ours, variable.unit, is_variable=True)
     points = read_axes(source, axes, dt_s, arrays, wanted, problems)
     if dt_s is None and "time" in points:
         points["time"].attrs[CLOCK] = axes["time"].unit

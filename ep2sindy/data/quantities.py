@@ -137,7 +137,7 @@ def words_of(name: str) -> tuple[str, ...]:
     return tuple(sorted(word for word in (WORDS.get(part, part) for part in parts) if word))
 
 
-def stated_step(name: str, value: float) -> float | None:
+def step_given_by(name: str, value: float) -> float | None:
     """Time step in s that a scalar of this name gives, or None if it is no step or rate."""
     last = last_of(name)
     plain = re.sub(r"[^a-z]", "", last.lower())
@@ -168,42 +168,42 @@ def axis_of(name: str) -> str | None:
     return "time" if time_unit_in(last) else None
 
 
-def axis_unit(axis: str, name: str, stated: str) -> str:
-    """Unit of an axis: the stated one, or that in its name; "" if neither is given."""
+def axis_unit(axis: str, name: str, file_unit: str) -> str:
+    """Unit of an axis: the one in the file, or in its name; "" if neither is given."""
     in_name = (time_unit_in(last_of(name)) or "") if axis == "time" else ""
-    options = (stated, in_name, split_unit(last_of(name))[1])
+    options = (file_unit, in_name, split_unit(last_of(name))[1])
     unit = COORDINATE_UNITS[axis]
     return next((u for u in options if u and (u == unit or converts(axis, u))), "")
 
 
-def quantity_of(name: str, stated: str, *, plasma: bool = False) -> tuple[str, str] | None:
+def quantity_of(name: str, file_unit: str, *, plasma: bool = False) -> tuple[str, str] | None:
     """Our name for an array, and the unit it has, "" for none; None if it keeps its own name.
 
-    A short name needs a unit that fits, stated or at its end; a full one stands for itself, unless
-    its unit contradicts it. stated: "" for none. plasma: short names stand for themselves too.
+    A short name needs a unit that fits, given or at its end; a full one stands for itself, unless
+    its unit contradicts it. file_unit: "" for none. plasma: short names stand for themselves too.
     """
     last = last_of(name)
     base, ending = split_unit(last)
-    unit = stated or ending
+    unit = file_unit or ending
     spelled = {words_of(text) for text in (name, last, base)} if not last.isdigit() else set()
     exact = (_in_hallthruster(name), last, base)
     for ours, full in FULL.items():
         if ours in exact or spelled & (full | SHORT[ours]):
-            is_stated = plasma or bool(spelled & full)
-            fits = converts(ours, unit, is_variable=True) if unit else is_stated
+            is_full = plasma or bool(spelled & full)
+            fits = converts(ours, unit, is_variable=True) if unit else is_full
             return (ours, unit) if fits else None
     return None
 
 
-def own_unit(ours: str, stated: str) -> str:
+def own_unit(ours: str, file_unit: str) -> str:
     """Unit that a file states, or that the suffix of a name promises, if it converts; else "1".
 
     A count of named things that the file states, such as `animals/ml`, stays as it is.
     """
-    if stated and is_count(stated):
-        return stated
+    if file_unit and is_count(file_unit):
+        return file_unit
     suffixes = [unit for suffix, unit in SUFFIX_UNITS.items() if ours.endswith(f"_{suffix}")]
-    options = (stated, *suffixes)
+    options = (file_unit, *suffixes)
     return next((u for u in options if u and converts(ours, u, is_variable=True)), "1")
 
 
@@ -214,8 +214,8 @@ def columns_in_si(
     values = np.empty(table.shape)
     units: dict[str, str] = {}
     for k, label in enumerate(table.columns):
-        name, stated = (label, "") if label.isidentifier() else split_name(label)
-        name, unit = quantity_of(name, stated) or (name, own_unit(name, stated))
+        name, in_label = (label, "") if label.isidentifier() else split_name(label)
+        name, unit = quantity_of(name, in_label) or (name, own_unit(name, in_label))
         units[name] = unit or "1"
         values[:, k] = without_marks(table[label].to_numpy(dtype=np.float64))
         if units[name] != "1" and not is_count(units[name]):
@@ -257,14 +257,14 @@ def to_si(array: xr.DataArray, ours: str, unit: str, *, is_variable: bool = Fals
     Raises ValueError for an unknown unit, one that the suffix cannot hold, or one that
     contradicts the file's own attribute.
     """
-    stated = str(array.attrs.get("units", ""))
-    if is_variable and unit == stated and is_count(unit):
+    file_unit = str(array.attrs.get("units", ""))
+    if is_variable and unit == file_unit and is_count(unit):
         return array.drop_attrs().assign_attrs(units=unit)
     factor, offset, target = conversion(ours, unit, is_variable=is_variable)
-    if stated not in ("", "1") and not same_unit(unit, stated):
+    if file_unit not in ("", "1") and not same_unit(unit, file_unit):
         raise ValueError(
             f"the unit of {ours} must agree with the file: the mapping says {unit!r}, the file "
-            f"{stated!r}; set it to what the numbers count"
+            f"{file_unit!r}; set it to what the numbers count"
         )
     if (factor, offset) != (1.0, 0.0):
         from ep2sindy.data.blocks import scale  # here, for it loads xarray
@@ -322,18 +322,18 @@ def converts(ours: str, unit: str, *, is_variable: bool = False) -> bool:
     return True
 
 
-def same_unit(unit: str, stated: str) -> bool:
+def same_unit(unit: str, file_unit: str) -> bool:
     """True if both texts mean the same unit, or if one of them is not a unit at all."""
     try:
-        a, b = _ruler(unit).to_base_units(), _ruler(counted_in(stated)).to_base_units()
+        a, b = _ruler(unit).to_base_units(), _ruler(counted_in(file_unit)).to_base_units()
     except UNIT_ERRORS:
         return True
     return a.check(b.dimensionality) and np.allclose(a.magnitude, b.magnitude, rtol=1e-9, atol=0.0)
 
 
-def counted_in(stated: str) -> str:
+def counted_in(attribute: str) -> str:
     """Unit of a NetCDF time attribute: `days` for `days since 1970-01-01`."""
-    return re.split(r"\s+since\s", stated, maxsplit=1)[0].strip()
+    return re.split(r"\s+since\s", attribute, maxsplit=1)[0].strip()
 
 
 def _ruler(unit: str) -> Any:

@@ -31,7 +31,7 @@ from ep2sindy.data.quantities import (
     last_of,
     own_unit,
     quantity_of,
-    stated_step,
+    step_given_by,
     words_of,
 )
 from ep2sindy.data.readers.source import FileSource
@@ -165,45 +165,44 @@ class _Arrays:
         return exact[0] if len(exact) == 1 else None
 
     @cached_property
-    def stated_s(self) -> float | None:
+    def given_s(self) -> float | None:
         """Time step in s that a preamble says, or scalars such as dt or fs if they agree."""
         scalars = [each for each in self.usable if not each.lengths and not each.dims]
         values = {
             e.name: e.low * (conversion("time", e.unit)[0] if converts("time", e.unit) else 1)
             for e in scalars
         }
-        stated = {stated_step(name, value) for name, value in values.items()} - {None}
-        return self.source.step_s or (stated.pop() if len(stated) == 1 else None)
+        steps = {step_given_by(name, value) for name, value in values.items()} - {None}
+        return self.source.step_s or (steps.pop() if len(steps) == 1 else None)
 
     def step_s(self, time: Variable | None) -> float | None:
         """Time step in s from outside the time array, or None.
 
         A time array comes first, unless it merely numbers the samples. Without one, the step that
-        is stated counts. Times that do not increase must still span what the step says, as rounded
-        ones do.
+        the file gives counts. Times that do not increase must still span what the step says, as
+        rounded ones do.
         """
-        stated_s = self.stated_s
-        if stated_s is None:
+        given_s = self.given_s
+        if given_s is None:
             return None
         if time is None:
-            return stated_s if self._spans(stated_s) else None
+            return given_s if self._spans(given_s) else None
         one = self.at(time)
         if one is None:
             return None
         usual_s = (one.step or 0.0) * conversion("time", time.unit or "s")[0]
-        is_rounded = one.digits is not None and isclose(usual_s, stated_s, rel_tol=0.2)
-        return stated_s if one.is_counter or is_rounded else None
+        is_rounded = one.digits is not None and isclose(usual_s, given_s, rel_tol=0.2)
+        return given_s if one.is_counter or is_rounded else None
 
-    def _spans(self, stated_s: float) -> bool:
+    def _spans(self, given_s: float) -> bool:
         """True unless times that do not increase span something else than steps of this length."""
         for each in self.usable:
-            span_s = (max(each.shape, default=1) - 1) * stated_s
-            differs = abs(each.high - each.low - span_s) > 0.01 * span_s + 10.0 * stated_s
+            span_s = (max(each.shape, default=1) - 1) * given_s
+            differs = abs(each.high - each.low - span_s) > 0.01 * span_s + 10.0 * given_s
             if each.falls and axis_of(each.name) == "time" and differs:
                 self.questions.append(
                     f"the times of {each.name!r} run over {each.high - each.low:.6g}, and samples "
-                    f"in the file's steps of {stated_s:.6g} s over {span_s:.6g} s: give dt_s if "
-                    "the "
+                    f"in the file's steps of {given_s:.6g} s over {span_s:.6g} s: give dt_s if the "
                     "steps are equal, or the segments as files of their own"
                 )
                 return False
@@ -217,13 +216,13 @@ class _Arrays:
         if (one := self.at(time)) is None:
             return time
         steps_s = {unit: (one.step or 0.0) * conversion("time", unit)[0] for unit in UNITS_OF_TIME}
-        if not time.unit and self.stated_s is not None:
+        if not time.unit and self.given_s is not None:
             fit = [
-                u for u, step_s in steps_s.items() if isclose(step_s, self.stated_s, rel_tol=1e-3)
+                u for u, step_s in steps_s.items() if isclose(step_s, self.given_s, rel_tol=1e-3)
             ]
             time = replace(time, unit=fit[0] if fit else "")
-        times, stated_s = f"the times of {one.name!r}", self.source.step_s
-        stated = f", and the file says steps of {stated_s:.6g} s next to them" if stated_s else ""
+        times, given_s = f"the times of {one.name!r}", self.source.step_s
+        beside = f", and the file says steps of {given_s:.6g} s next to them" if given_s else ""
         usual_s = (one.step or 0.0) * conversion("time", time.unit or "s")[0]
         if one.digits is not None:
             self.questions.append(
@@ -233,11 +232,11 @@ class _Arrays:
         if one.gap:
             unit = f", in {time.unit}" if time.unit else ""
             self.questions.append(
-                f"{times} have a gap: {one.gap}{unit}{stated}; the times are taken as they stand"
+                f"{times} have a gap: {one.gap}{unit}{beside}; the times are taken as they stand"
             )
-        elif stated_s and usual_s and time.unit and abs(usual_s - stated_s) > 0.01 * stated_s:
+        elif given_s and usual_s and time.unit and abs(usual_s - given_s) > 0.01 * given_s:
             self.questions.append(
-                f"{times} go in steps of {usual_s:.6g} s{stated}; the times are taken"
+                f"{times} go in steps of {usual_s:.6g} s{beside}; the times are taken"
             )
         return time
 
@@ -303,8 +302,8 @@ class _Arrays:
         fit = [each for each in rest if self._fits(each, known, lengths)]
         meant: dict[str, dict[str, str]] = {}  # our name -> names in the file, with their units
         for each in fit:
-            stated = "" if each.unit == "1" else each.unit
-            if (quantity := quantity_of(each.name, stated, plasma=self.plasma)) is not None:
+            unit = "" if each.unit == "1" else each.unit
+            if (quantity := quantity_of(each.name, unit, plasma=self.plasma)) is not None:
                 meant.setdefault(quantity[0], {})[each.name] = quantity[1]
         found: dict[str, Variable] = {}
         for ours, options in meant.items():

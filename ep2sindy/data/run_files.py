@@ -309,6 +309,6 @@ def _parameter_in(
 
 
 def _in_si(name: str, value: xr.DataArray, units: Mapping[str, str]) -> xr.DataArray:
-    """A value in SI, or in the unit of its name's suffix, by the unit that is given or stated."""
+    """A value in SI, or in the unit of its name's suffix, by the unit given here or in the file."""
     unit = units.get(name) or own_unit(name, str(value.attrs.get("units", "")))
     return to_si(value, name, unit, is_variable=True)

@@ -182,8 +182,8 @@ def _from_field(field: xr.Dataset, partial: bool) -> Trajectory:
         )
     if (unit := str(field["time"].attrs.get("units", "s"))) != "s":
         times = seconds_in(unit) * field["time"].values
-        stated = {CLOCK: unit} | field["time"].attrs | {"units": "s"}
-        field = field.assign_coords(time=("time", times, stated))
+        attrs = {CLOCK: unit} | field["time"].attrs | {"units": "s"}
+        field = field.assign_coords(time=("time", times, attrs))
     run = _from_table(field.to_dataframe()[list(field.data_vars)], partial)
     units = {str(name): str(each.attrs.get("units", "1")) for name, each in field.variables.items()}
     point = {

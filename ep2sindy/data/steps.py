@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from ep2sindy.data.quantities import axis_of, stated_step
+from ep2sindy.data.quantities import axis_of, step_given_by
 from ep2sindy.data.readers.registry import open_source
 from ep2sindy.data.readers.source import FileSource, damage_named
 
@@ -224,7 +224,7 @@ def _stack(places: Sequence[Place], name: str, numbers: Sequence[int], named: bo
                 f"{array.shape} at step {number}; leave out the files or groups that differ"
             )
     values = np.stack([array.values for array in arrays])
-    is_step = not first.ndim and stated_step(name, float(values[0])) is not None
+    is_step = not first.ndim and step_given_by(name, float(values[0])) is not None
     if (first.ndim or is_step) and (values == values[0]).all():
         return first
     dims = ["steps", *map(str, first.dims)] if named else None

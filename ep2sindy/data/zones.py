@@ -369,9 +369,8 @@ def zone_slices(field: xr.Dataset, zone: Zone) -> dict[str, slice]:
         beyond = max(points[0] - bounds[0] - steps[0], bounds[1] - points[-1] - steps[-1])
         if start >= stop or beyond > rounding:
             raise ValueError(
-                f"a zone must hold grid points and stay on the grid, got {axis} from "
-                f"{bounds[0]:g} to "
-                f"{bounds[1]:g} m, the grid has {len(points)} points from {points[0]:g} to "
+                f"a zone must hold grid points and stay on the grid, got {axis} from {bounds[0]:g} "
+                f"to {bounds[1]:g} m, the grid has {len(points)} points from {points[0]:g} to "
                 f"{points[-1]:g} m; take a zone on the grid ('trajectory.zone.{axis}=[FROM,TO]')"
             )
         slices[axis] = slice(start, stop)

@@ -135,9 +135,8 @@ class TrajectorySearch:
         """
         if task.facts.roles is not None and self.selection.basis == "runs":
             raise ValueError(
-                "a search of trajectories keeps roles by likelihood: selection must be "
-                "Evidence(), got "
-                f"{self.selection!r}; Regression(selection=FreeRunScore()) tests by runs"
+                "a search of trajectories keeps roles by likelihood: selection must be Evidence(), "
+                f"got {self.selection!r}; Regression(selection=FreeRunScore()) tests by runs"
             )
         found = self._estimate(task, progress)
         library = task.library.with_known_terms(task.states)

@@ -137,7 +137,7 @@ class Preparation:
         return replace(self, how="derivative" if is_rate else self.how, degree=1, functions=())
 
     def search(
-        self, past: Signal, method: AnyMethod, stated: StatedFacts, *, seed: int,
+        self, past: Signal, method: AnyMethod, facts: StatedFacts, *, seed: int,
         progress: Progress,
         once: Once,
     ) -> tuple[Embedded, Discovery]:  # fmt: skip
@@ -148,23 +148,23 @@ class Preparation:
         run, functions = states.run, self.functions
         if any(FITTED in text for text in functions):
             smoothed = make() if states.unsmoothed else states
-            off = partial(self._lack_of_fit, smoothed, method, stated)
+            off = partial(self._lack_of_fit, smoothed, method, facts)
             functions = fit_functions(functions, smoothed.run, off)
         if states.unsmoothed:
             run, method = end_of(run), by_trajectories(method)
         elif not states.known or self.n_states > 2:
             method = replace(method, depth=min(method.depth, FEW))
-        library = self._library(states, functions, stated)
+        library = self._library(states, functions, facts)
         search = partial(
             discover, run, library, method, hidden=states.hidden, decimate=None, seed=seed
         )
         return states, once(partial(search, progress=progress))
 
-    def _library(self, states: Embedded, functions: Sequence[str], stated: StatedFacts) -> Library:
-        return stated.add_to(states.library(self.degree, functions, self.function_degree), states)
+    def _library(self, states: Embedded, functions: Sequence[str], facts: StatedFacts) -> Library:
+        return facts.add_to(states.library(self.degree, functions, self.function_degree), states)
 
     def _lack_of_fit(
-        self, states: Embedded, method: AnyMethod, stated: StatedFacts, functions: Sequence[str]
+        self, states: Embedded, method: AnyMethod, facts: StatedFacts, functions: Sequence[str]
     ) -> float:
         """What the largest candidates leave of the derivatives, the product over equations.
 
@@ -173,7 +173,7 @@ class Preparation:
         if isinstance(method, TrajectorySearch):
             method = Regression(search=BestSubset(max_terms=method.max_terms or FIRST_MAX_TERMS))
         try:
-            library = self._library(states, functions, stated)
+            library = self._library(states, functions, facts)
             equations = method.search_equations(DiscoveryProblem([states.run], library), rng=0)
         except ValueError:
             return float("inf")
@@ -253,7 +253,7 @@ class Attempt:
 
 def try_in_turn(
     past: Signal, tried: Sequence[Preparation], method: AnyMethod, *,
-    stated: StatedFacts | None = None, linear: bool | None = None,
+    facts: StatedFacts | None = None, linear: bool | None = None,
     seed: int = 0, progress: Progress = SILENT, once: Once = at_once,
 ) -> list[Attempt]:  # fmt: skip
     """Find a model of a signal by each preparation that can pay.
@@ -264,12 +264,12 @@ def try_in_turn(
     states are tried only of a signal that does not repeat itself, and that no input drives: one of
     two states either repeats itself or spirals. The signal alone is tried only with inputs. Of a
     linear signal, linear equations of the first smoothed states alone are tried. method: of the
-    search in smoothed states; a rule that runs models tests them by the signal. stated: of the
+    search in smoothed states; a rule that runs models tests them by the signal. facts: of the
     equations. linear: whether the signal is (`is_linear`); None finds out. once: does each search,
     or takes it from a run that was interrupted.
     Raises FailedTryError if every try failed.
     """
-    stated, linear = stated or StatedFacts(), is_linear(past) if linear is None else linear
+    facts, linear = facts or StatedFacts(), is_linear(past) if linear is None else linear
     smoothed = [each for each in tried if each.how != "hidden"]
     if past.run.input_names:  # then they make what is more than a cycle
         tried = [each for each in tried if each.n_states <= 2] or tried
@@ -284,7 +284,7 @@ def try_in_turn(
     left_out, failed = [], FailedTryError()
     for each in tried:
         search = partial(
-            each.search, method=method, stated=stated, seed=seed, progress=progress, once=once
+            each.search, method=method, facts=facts, seed=seed, progress=progress, once=once
         )
         try:
             brief = each.how == "hidden" and smoothed and part is not past

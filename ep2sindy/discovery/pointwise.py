@@ -96,8 +96,7 @@ class PointSearch:
         if facts.roles is not None:
             raise ValueError(
                 "roles tie all equations together, and a pointwise study searches one at a time, "
-                "got "
-                f"{facts.roles}; give relations"
+                f"got {facts.roles}; give relations"
             )
         if facts.relations and (n_culled := self.method.bootstraps.n_culled):
             raise ValueError(

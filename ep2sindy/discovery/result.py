@@ -373,8 +373,7 @@ def _encode(value: Any) -> Any:
     if name is None or not is_dataclass(value):
         raise ValueError(
             "a discovery is stored with its method, of classes of this package alone, got "
-            f"{value!r}"
-            "; store its model, found.model.save(path)"
+            f"{value!r}; store its model, found.model.save(path)"
         )
     return {"class": name, **{f.name: _encode(getattr(value, f.name)) for f in fields(value)}}
 

@@ -25,7 +25,7 @@ NUMBERS, PER_TERM = 2.5, 10.0
 SECONDS, MORE_SECONDS = 2.5e-5, 0.8e-8
 # Samples of the parts of a long record that a search with a limit takes first, in blocks.
 PARTS, BLOCKS = tuple(4**k for k in range(7, 16)), 8
-SOON_S = 60.0  # a search that takes longer is stated of
+SOON_S = 60.0  # a search that takes longer is announced
 
 
 class SlowSearch(UserWarning):

@@ -49,9 +49,7 @@ from ep2sindy.runtime.values import check_count
 
 MAX_RIVALS = 5
 MIN_ODDS = 1e-3  # rivals with lower posterior odds are not reported
-MIN_PROBABILITY = (
-    0.5  # least probability of all supports; with less, the samples do not tell which it is
-)
+MIN_PROBABILITY = 0.5  # of all supports; with less, the samples do not tell which it is
 EVEN = 0.2  # above these posterior odds of a rival, the choice is reported as ambiguous
 
 
@@ -250,7 +248,7 @@ def estimate(
     library, constraint = task.library.with_known_terms(task.states), None
     if facts.roles is not None:
         played = compress(answer.solution.problem.processes, answer.solution.fit.free != 0.0)
-        constraint = constraint_of(library, task.states, list(played), facts.roles.stated)
+        constraint = constraint_of(library, task.states, list(played), facts.roles.known_processes)
     model = _model(answer, library, fitted[0][0].units, provenance or {})
     return replace(_report(answer, model, fitted, watch), constraint=constraint)
 
@@ -350,7 +348,7 @@ class _Way:
 
     def begin(self, settings: _Settings) -> Explanation:
         """Answer under process noise."""
-        return self._stated(explain_under_noise(self.problem, max_terms=settings.max_terms))
+        return self._with_warnings(explain_under_noise(self.problem, max_terms=settings.max_terms))
 
     def answer(self, settings: _Settings, under_noise: Explanation | None = None) -> Answer:
         """Answer by an exact trajectory, if one explains the samples; with the runs as fitted."""
@@ -369,9 +367,9 @@ class _Way:
             fitted = list(by_run(problem, paths, self.runs))
             if not problem.measured.all():
                 check_repeats([run for run, _ in fitted])
-        return self._stated(found), fitted
+        return self._with_warnings(found), fitted
 
-    def _stated(self, found: Explanation) -> Explanation:
+    def _with_warnings(self, found: Explanation) -> Explanation:
         return replace(found, data_warnings=(*self.words, *found.data_warnings))
 
 
@@ -506,13 +504,13 @@ def _open_choice(
     Penalties of terms are log prior odds, so scores give posterior probabilities (Schwarz 1978,
     doi:10.1214/aos/1176344136).
     """
-    fraction = 1.0
+    chance = 1.0
     for weighed in supports.values():
-        fraction /= sum(each.odds for each in weighed)
-    if fraction >= MIN_PROBABILITY:
+        chance /= sum(each.odds for each in weighed)
+    if chance >= MIN_PROBABILITY:
         return ""
     return (
         f"{problem.n_samples} samples do not tell these equations from others: the chance that all "
-        f"terms are right is {100.0 * fraction:.0f} %; name the terms that you know "
+        f"terms are right is {100.0 * chance:.0f} %; name the terms that you know "
         "(Library.only), take a smaller library, or a longer record"
     )

@@ -57,7 +57,7 @@ from ep2sindy.trust.interruption import is_interruption
 ADVICE = (
     "Name a hidden state (hidden=[...]), embed one signal (+exp=trace), or measure another state"
 )
-# Model error of the fits that compare courses: an input half a step delayed shows, with all terms.
+# Model error of the fits that compare courses: an input half a step late shows, with all terms.
 COURSES_AT = 0.1
 BETTER = 4.0  # least fall of -2 log likelihood for which the most plausible course is left
 MORE_TERMS = 5  # of one equation, where all allowed are used

@@ -167,10 +167,10 @@ class Gram:
     def minimise(self, over: Bool[np.ndarray, " z"]) -> Gram:
         """The least squares over some of the unknowns, as a function of the rest."""
         rest, inverse = ~over, invert_gram(self.quadratic[np.ix_(over, over)])
-        fraction = self.quadratic[np.ix_(rest, over)] @ inverse
+        projection = self.quadratic[np.ix_(rest, over)] @ inverse
         return Gram(
-            self.quadratic[np.ix_(rest, rest)] - fraction @ self.quadratic[np.ix_(over, rest)],
-            self.linear[rest] - fraction @ self.linear[over],
+            self.quadratic[np.ix_(rest, rest)] - projection @ self.quadratic[np.ix_(over, rest)],
+            self.linear[rest] - projection @ self.linear[over],
             self.offset - float(self.linear[over] @ inverse @ self.linear[over]),
         )
 
@@ -273,10 +273,10 @@ def divergence_rate(fit: TrajectoryFit) -> float:
     about, _, logs = innovations(fit)
     precision = np.where(np.isfinite(about.residuals), 1.0 / about.variance, 0.0)
     by_record = np.add.reduceat(precision, np.append(0, fit.problem.all_records.breaks + 1))
-    stated = (
+    information = (
         logs + np.log(precision[precision > 0.0]).sum() - np.log1p(FREE_START * by_record).sum()
     )
-    return max(float(stated), 0.0) / fit.problem.n_samples
+    return max(float(information), 0.0) / fit.problem.n_samples
 
 
 def innovations(fit: TrajectoryFit) -> tuple[Linearised, float, float]:

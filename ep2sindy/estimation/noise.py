@@ -40,17 +40,8 @@ BEFORE = (1, 2)
 # with; and standard errors by which these may explain more of random residuals than their number.
 MORE_DEGREES, MAX_POWERS, FOLLOWS = 2, 60, 6.0
 TINY = float(np.finfo(np.float64).tiny)
-FRACTIONS = (
-    0.1,
-    0.3,
-    0.5,
-    0.7,
-    0.9,
-    0.97,
-    0.99,
-    0.999,
-    0.9999,
-)  # of growing variance, tried in turn
+# Of growing variance, tried in turn.
+FRACTIONS = (0.1, 0.3, 0.5, 0.7, 0.9, 0.97, 0.99, 0.999, 0.9999)
 GROWTH_SHOWS = 12.0  # least gain in 2 log likelihood for noise that grows
 OUTLYING = 5.0  # standard deviations
 ORDER = 3  # of differences, which remove most of a signal that the samples resolve

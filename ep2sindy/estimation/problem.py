@@ -419,9 +419,9 @@ def _rms(runs: Sequence[Trajectory], names: Sequence[str]) -> Float[np.ndarray, 
 def _allow_courses(
     runs: Sequence[Trajectory], inputs: Sequence[str], courses: Mapping[str, str]
 ) -> dict[str, tuple[str, ...]]:
-    """Courses of every input that its samples allow, or the one that is stated."""
-    stated = {name: (course,) for name, course in check_courses(courses, inputs).items()}
-    return {n: plausible_courses([run.columns([n]) for run in runs]) for n in inputs} | stated
+    """Courses of every input that its samples allow, or the one that is given."""
+    given = {name: (course,) for name, course in check_courses(courses, inputs).items()}
+    return {n: plausible_courses([run.columns([n]) for run in runs]) for n in inputs} | given
 
 
 def by_run(

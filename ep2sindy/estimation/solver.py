@@ -213,16 +213,16 @@ def polish(fit: TrajectoryFit, penalties: ByCoefficient) -> tuple[TrajectoryFit,
     fit = refit(fit)
     tried = {fit.support.tobytes()}
     for _ in range(MAX_ROUNDS):
-        precompile = refit(replace(fit, model_error=COMPARED_AT))
-        around = delayed_gram(precompile)
+        warm = refit(replace(fit, model_error=COMPARED_AT))
+        around = delayed_gram(warm)
         at_rest = without_delays(around, problem.n_free)
         if not (at_rest.finite and np.isfinite(fit.total)):
             break
-        others = alternatives(problem, at_rest, penalties, precompile.support, within=WITHIN)
+        others = alternatives(problem, at_rest, penalties, warm.support, within=WITHIN)
         others = [each for each in others if each.support.tobytes() not in tried]
         for each in others[:MAX_TRIED]:
             tried.add(each.support.tobytes())
-            other = refit(replace(precompile, support=each.support, free=each.free))
+            other = refit(replace(warm, support=each.support, free=each.free))
             other = refit(replace(other, model_error=fit.model_error))
             if _is_likelier(other, fit, penalties):
                 fit = other

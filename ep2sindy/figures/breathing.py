@@ -169,7 +169,7 @@ def _exit_cm(field: xr.Dataset) -> list[float]:
 
 def last_periods(t: Float[np.ndarray, " time"], f_kHz: float, periods: float) -> slice:
     """The last few periods of a record; a tenth of the record if there is no frequency."""
-    fraction = 0.1 * (t[-1] - t[0])
-    duration_s = periods / (1e3 * f_kHz) if np.isfinite(f_kHz) and f_kHz > 0.0 else fraction
+    tenth_s = 0.1 * (t[-1] - t[0])
+    duration_s = periods / (1e3 * f_kHz) if np.isfinite(f_kHz) and f_kHz > 0.0 else tenth_s
     start = int(np.searchsorted(t, t[-1] - duration_s))
     return slice(max(0, min(start, t.size - 16)), t.size)

@@ -378,8 +378,8 @@ def calibrate(
         [_width(column) for column in np.moveaxis(off[:, start:stop], 2, 0)]
         for start, stop in pairwise(edges)
     ]
-    stated = BandWidths(tried[best].steps_s[edges[1:] - 1], widths)
-    return replace(tried[best].estimator, widths=stated)
+    bands = BandWidths(tried[best].steps_s[edges[1:] - 1], widths)
+    return replace(tried[best].estimator, widths=bands)
 
 
 def _width(off: Float[np.ndarray, "starts ahead"]) -> float:

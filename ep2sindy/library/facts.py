@@ -46,8 +46,7 @@ class Facts:
         if self.relations or self.only or self.excluded or self.known:
             raise ValueError(
                 "roles say which terms the equations may have and how they are tied, got "
-                "relations, "
-                "terms, or coefficients as well; give roles alone, or leave them out"
+                "relations, terms, or coefficients as well; give roles alone, or leave them out"
             )
 
     def __or__(self, more: Facts) -> Facts:
@@ -93,8 +92,7 @@ class Facts:
             if len(places) == len(library.names):
                 raise ValueError(
                     f"exclude must leave terms to every equation, got all {len(places)} of the "
-                    "library"
-                    f" for {state!r}; leave some of them out of exclude"
+                    f"library for {state!r}; leave some of them out of exclude"
                 )
         for state, term in self.places:
             if library.index(term) in barred.get(state, ()):

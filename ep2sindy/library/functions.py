@@ -279,8 +279,7 @@ def _check_derivative(
         if found.shape != points.shape or not np.isfinite(found).all():
             raise ValueError(
                 f"{what} of {name!r} must give a finite number for each of {points.tolist()}, got "
-                f"{found.tolist()}; write it with NumPy, and give domain=(low, high) where "
-                "it ends"
+                f"{found.tolist()}; write it with NumPy, and give domain=(low, high) where it ends"
             )
     differences = (ahead - behind) / (2.0 * step)
     rounding = 1e-9 * np.abs(values) / step

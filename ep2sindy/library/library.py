@@ -161,23 +161,21 @@ class Library:
 
     def at_operating_point(self, parameters: Mapping[str, float]) -> Library:
         """This library with relations in place of `known`: the numbers at an operating point."""
-        stated = []
+        known = []
         for (state, term), factors in self.facts.known_factors.items():
             functions = functions_of_point(list(parameters), f"{state}: {term}", factors)
             values = functions.evaluate(np.array([*parameters.values()]))
             value = float(values @ np.array([*factors.values()]))
-            stated.append(Relation(((1.0, state, term),), value, f"{state}: {term} == {value!r}"))
-        return (
-            replace(self, facts=replace(self.facts, known={})).relate(*stated) if stated else self
-        )
+            known.append(Relation(((1.0, state, term),), value, f"{state}: {term} == {value!r}"))
+        return replace(self, facts=replace(self.facts, known={})).relate(*known) if known else self
 
     def with_known_terms(self, states: Sequence[str]) -> Library:
         """With all terms of equations that the roles know; those added stand in no other.
 
         Raises ValueError for a term of something that is no variable or state.
         """
-        stated = self.facts.roles.known if self.facts.roles else {}
-        missing = dict.fromkeys(term for _, term in stated if term not in self.names)
+        known = self.facts.roles.known if self.facts.roles else {}
+        missing = dict.fromkeys(term for _, term in known if term not in self.names)
         if not missing:
             return self
         variables = tuple(dict.fromkeys([*self.variables, *states]))
@@ -372,12 +370,12 @@ class Library:
         unsorted = library_of(self.variables, distinct)
         order = np.lexsort(unsorted.exponents.T[::-1])
         places = {distinct[k]: place for place, k in enumerate(order.tolist())}
-        fractions = np.zeros((len(self), 1 + n, len(distinct)))
-        for row, sums in zip(fractions, slopes, strict=True):
+        weights = np.zeros((len(self), 1 + n, len(distinct)))
+        for row, sums in zip(weights, slopes, strict=True):
             for column, parts in zip(row, sums, strict=True):
                 for term, weight in parts.items():
                     column[places[term]] = weight
-        return unsorted.take(order), fractions
+        return unsorted.take(order), weights
 
     @cached_property
     def _named(self) -> dict[str, int]:

@@ -50,8 +50,7 @@ def check_variable(name: str) -> None:
         other = f"x{word}" if word[0].isdecimal() else word
         raise ValueError(
             "a variable's name must be a word of letters, digits and _, such as 'n_i', got "
-            f"{name!r}"
-            f"; rename it, perhaps {other!r}"
+            f"{name!r}; rename it, perhaps {other!r}"
         )
 
 
@@ -124,8 +123,7 @@ def split_term(name: str) -> list[Part]:
     if not _TERM.fullmatch(name):
         raise ValueError(
             "a term is variables joined by *, with whole powers, and functions of one variable, "
-            "got "
-            f"{name!r:.300}; write it like 'n_i^2*n_n', 'x*sin(2*y)' or 'x/(0.5+y)'"
+            f"got {name!r:.300}; write it like 'n_i^2*n_n', 'x*sin(2*y)' or 'x/(0.5+y)'"
         )
     parts = []
     for found in _FACTORS.finditer(name):

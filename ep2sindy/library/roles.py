@@ -179,7 +179,7 @@ class Roles:
         return tuple(dict.fromkeys([*named, *self.sizes, *self.equations]))
 
     @property
-    def stated(self) -> list[Process]:
+    def known_processes(self) -> list[Process]:
         """The processes whose coefficients are known: of known roles, and of known equations."""
         found = [
             replace(self._process(role, term), value=float(value))
@@ -196,7 +196,7 @@ class Roles:
     @property
     def known(self) -> dict[Place, float]:
         """What known processes add to the coefficients, in SI."""
-        return sum_known(self.stated)
+        return sum_known(self.known_processes)
 
     def with_known(self, known: Mapping[str, Mapping[str, float]]) -> Roles:
         """These roles with what a record gives in place of "known".
@@ -278,12 +278,12 @@ class Roles:
                 terms = _carriers(f"{state}@{zone}", [*own, there])
                 exchange.append((f"{state}@{zone}", there, terms))
         last = [f"{state}@{zones[-1]}" for state in states]
-        fraction = sum(sizes.values()) / sizes[zones[0]]
+        ratio = sum(sizes.values()) / sizes[zones[0]]
         return Roles(
             exchange=exchange,
             outflow={f"{s}@{zones[-1]}": _carriers(f"{s}@{zones[-1]}", last) for s in self.outflow},
             inflow={
-                f"{state}@{zones[0]}": value if isinstance(value, str) else fraction * value
+                f"{state}@{zones[0]}": value if isinstance(value, str) else ratio * value
                 for state, value in self.inflow.items()
             },
             sizes={f"{state}@{zone}": sizes[zone] for zone in zones for state in states},
@@ -351,8 +351,8 @@ class Roles:
         moved += _bodies(role.taker).items()
         first = self.sizes.get(moved[0][0], 1.0)
         for state, n in moved:
-            fraction = n * first / self.sizes.get(state, 1.0)
-            factors[state, term] = factors.get((state, term), 0.0) + fraction
+            factor = n * first / self.sizes.get(state, 1.0)
+            factors[state, term] = factors.get((state, term), 0.0) + factor
         factors = {place: factor for place, factor in factors.items() if factor}
         signed = self.nonnegative or (not role.taker and role.how == FREE)
         return Process(role.name, term, MappingProxyType(factors), one_sign=signed)
@@ -417,10 +417,10 @@ def _carriers(state: str, others: Sequence[str]) -> list[str]:
     return [state, *(product_of(Counter([state, other])) for other in others)]
 
 
-def sum_known(stated: Sequence[Process]) -> dict[Place, float]:
+def sum_known(processes: Sequence[Process]) -> dict[Place, float]:
     """What processes with known coefficients add to the coefficients of a model, in SI."""
     found: dict[Place, float] = {}
-    for process in stated:
+    for process in processes:
         for place, factor in process.factors.items():
             found[place] = found.get(place, 0.0) + factor * (process.value or 0.0)
     return found
@@ -430,30 +430,30 @@ def constraint_of(
     library: NamedTerms,
     states: Sequence[str],
     processes: Sequence[Process],
-    stated: Sequence[Process] = (),
+    known: Sequence[Process] = (),
 ) -> Constraint | None:
     """The exact constraint of a model with these processes, and those with known coefficients.
 
     Returns None if the coefficients do not determine the processes, as with an exchange and the
     outflow of both states by one term.
     """
-    known = sum_known(stated)
+    amounts = sum_known(known)
     places = {place for process in processes for place in process.factors}
-    places |= {*known}
+    places |= {*amounts}
     order = sorted(places, key=lambda at: (states.index(at[0]), library.index(at[1])))
-    fractions = np.array([[p.factors.get(place, 0.0) for p in processes] for place in order])
-    fixed = np.array([known.get(place, 0.0) for place in order])
-    free = _independent_rows(fractions)
+    factors = np.array([[p.factors.get(place, 0.0) for p in processes] for place in order])
+    fixed = np.array([amounts.get(place, 0.0) for place in order])
+    free = _independent_rows(factors)
     if len(free) < len(processes):
         return None
-    C = fractions @ np.linalg.inv(fractions[free])
+    C = factors @ np.linalg.inv(factors[free])
     # Most factors are 1, -1 and 0 and so is the result: rounding removes what the inverse adds.
     C = np.where(np.abs(C - np.rint(C)) < 1e-9, np.rint(C), C) + 0.0
     d = fixed - C @ fixed[free]
-    return Constraint(tuple(states), tuple(order), C, d, free, tuple(processes), tuple(stated))
+    return Constraint(tuple(states), tuple(order), C, d, free, tuple(processes), tuple(known))
 
 
-def fractions_of(held: Constraint) -> Float[np.ndarray, "free processes"]:
+def process_matrix(held: Constraint) -> Float[np.ndarray, "free processes"]:
     """What the constraint's processes, with coefficients of one, make of its free coefficients."""
     places = [held.coefficients[k] for k in held.free]
     return np.array([[p.factors.get(at, 0.0) for p in held.processes] for at in places])
@@ -466,9 +466,9 @@ def process_amounts(
     known = sum_known(held.known)
     places = [held.coefficients[k] for k in held.free]
     found = [terms[s].get(term, 0.0) - known.get((s, term), 0.0) for s, term in places]
-    values = np.linalg.solve(fractions_of(held), found).tolist()
-    stated = [(process, process.value or 0.0) for process in held.known]
-    return [*zip(held.processes, values, strict=True), *stated]
+    values = np.linalg.solve(process_matrix(held), found).tolist()
+    given = [(process, process.value or 0.0) for process in held.known]
+    return [*zip(held.processes, values, strict=True), *given]
 
 
 def _independent_rows(matrix: Float[np.ndarray, "rows columns"]) -> np.ndarray:

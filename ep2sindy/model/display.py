@@ -36,8 +36,7 @@ def model_lines(
         terms, reach = _per_time_unit(model, state, held)
         parts = equation_parts(terms, reach=reach) or ["0"]
         parts[-1] += f" [{_rate_unit(model, state)}]"
-        fraction = 1 + spare // (len(states) - k)
-        own = wrap([f"{state}' =", *parts], what="terms", n_lines=fraction)
+        own = wrap([f"{state}' =", *parts], what="terms", n_lines=1 + spare // (len(states) - k))
         spare -= len(own) - 1
         lines += own
     return [*lines, *tail]

@@ -117,8 +117,8 @@ class VectorField:
     @cached_property
     def weights(self) -> Float[np.ndarray, "d columns products"]:
         """Weights W of the products in the rates, then in their derivatives by each state."""
-        fractions, used = self.library.with_derivatives(self.n_states)[1], self.coef.any(axis=1)
-        found: np.ndarray = np.tensordot(self.coef[used].T, fractions[used], axes=1)
+        weights, used = self.library.with_derivatives(self.n_states)[1], self.coef.any(axis=1)
+        found: np.ndarray = np.tensordot(self.coef[used].T, weights[used], axes=1)
         return found
 
     @property

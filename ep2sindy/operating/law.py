@@ -430,22 +430,22 @@ def constrain_law(
     """
     given = library.facts.relations
     functions = named_terms(list(parameters), ["1"])
-    stated = {}
+    known = {}
     for (state, term), factors in library.facts.known_factors.items():
         own = functions_of_point(parameters, f"{state}: {term}", factors)
         functions = functions + own
-        stated[state, term] = dict(zip(own.names, factors.values(), strict=True))
+        known[state, term] = dict(zip(own.names, factors.values(), strict=True))
     columns = []
     for name in functions.names:
         # Relations are linear in their values: one function of the parameters at a time.
         values = [replace(r, value=r.value if name == "1" else 0.0) for r in given]
         values += [
             Relation(((1.0, state, term),), factors.get(name, 0.0), _text(state, term, factors))
-            for (state, term), factors in stated.items()
+            for (state, term), factors in known.items()
         ]
         columns.append(constraint(library, structure, values))
     common = replace(columns[0], d=np.zeros(len(columns[0].d)))
-    texts = [r.text for r in given] + [_text(*pair, factors) for pair, factors in stated.items()]
+    texts = [r.text for r in given] + [_text(*pair, factors) for pair, factors in known.items()]
     if texts and not len(common.free):
         raise ValueError(f"a law needs a free coefficient: {texts} leave none; drop one of them")
     return LawConstraint(common, functions, np.column_stack([c.d for c in columns]), tuple(texts))

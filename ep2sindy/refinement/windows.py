@@ -172,8 +172,8 @@ def _places(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Segment and first sample of every window, in proportion to the room in the segments."""
     room = np.array([max(n - window + 1, 0) for n in lengths])
-    fraction = np.minimum(np.round(n_windows * np.cumsum(room) / room.sum()), np.cumsum(room))
-    counts = np.minimum(np.diff(fraction, prepend=0.0).astype(int), room)
+    ends = np.minimum(np.round(n_windows * np.cumsum(room) / room.sum()), np.cumsum(room))
+    counts = np.minimum(np.diff(ends, prepend=0.0).astype(int), room)
     firsts = [_spread(int(r), int(m), window, rng) for r, m in zip(room, counts, strict=True)]
     return np.repeat(np.arange(len(lengths)), counts), np.concatenate(firsts)
 

@@ -103,8 +103,7 @@ class ParetoFront:
     sizes form the front proper, along which the error decreases; the others are runners-up. A
     search shared by several points ranks by all of them, so errors may increase at one point.
     problem: rows that the candidates were fitted to; None for a search of trajectories. ensemble:
-    all supports that the candidates were taken from; None if the front was not made from a
-    ensemble.
+    all supports that the candidates were taken from; None if the front was made from none.
     """
 
     equation: str

@@ -13,10 +13,10 @@ from ep2sindy.runtime.compilation import INNER_REORDERED, LOOPS, REORDERED, comp
 
 WITHIN = {**LOOPS, "no_cpython_wrapper": True}  # for kernels that only kernels call
 
-# A column counts as dependent on others if their residual of its square falls below this fraction.
+# A column counts as dependent on others if they leave less than this fraction of its square.
 DEPENDENT = 1e-11
 
-# A residual of the target's square below this fraction counts as rounding.
+# What is left of the target's square counts as rounding below this fraction.
 ROUNDING = 1e-15
 
 

@@ -377,11 +377,11 @@ class _Problems:
         """Residual if each term joins the chosen ones; infinite for one that depends on them."""
         columns, target = self.xx[:, :, chosen], self.xy[:, chosen]
         inverse = invert_gram(columns[:, chosen])
-        fraction = columns @ inverse
+        projection = columns @ inverse
         square = np.einsum("pjj->pj", self.xx)
-        own = square - np.einsum("pjs,pjs->pj", fraction, columns)
+        own = square - np.einsum("pjs,pjs->pj", projection, columns)
         adds = own > DEPENDENT * square
-        gain = np.square(self.xy - np.einsum("pjs,ps->pj", fraction, target))
+        gain = np.square(self.xy - np.einsum("pjs,ps->pj", projection, target))
         left = self.yy - np.einsum("ps,pst,pt->p", target, inverse, target)
         residuals = left[:, None] - np.where(adds, gain / np.where(adds, own, 1.0), 0.0)
         residuals = np.maximum(residuals, ROUNDING * self.yy[:, None])

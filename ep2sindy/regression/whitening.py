@@ -143,22 +143,22 @@ class _Sums(NamedTuple):
     """Some scaled terms and their derivatives, as sums of products.
 
     kept: (library terms,), mask of the terms. products: library of the products, of which the rows
-    of `table` are used. fractions: (kept, products), of the terms, then of their derivatives by
+    of `table` are used. weights: (kept, products), of the terms, then of their derivatives by
     each variable.
     """
 
     kept: Bool[np.ndarray, " terms"]
     products: Library
     table: Int[np.ndarray, "products factors"]
-    fractions: Sequence[csr_array]
+    weights: Sequence[csr_array]
 
     @staticmethod
     def of(problem: RegressionRows, kept: Bool[np.ndarray, " terms"]) -> _Sums:
         library = problem.library
-        products, fractions = library.with_derivatives(len(library.variables))
-        fractions = fractions[kept] / problem.theta_scale[kept, None, None]
-        used = fractions.any(axis=(0, 1))
-        parts = [csr_array(fraction) for fraction in fractions[:, :, used].transpose(1, 0, 2)]
+        products, weights = library.with_derivatives(len(library.variables))
+        weights = weights[kept] / problem.theta_scale[kept, None, None]
+        used = weights.any(axis=(0, 1))
+        parts = [csr_array(weight) for weight in weights[:, :, used].transpose(1, 0, 2)]
         return _Sums(kept, products, products.table[used], parts)
 
     def linearise(
@@ -175,10 +175,10 @@ class _Sums(NamedTuple):
         values = columns[self.table[:, 0]]
         for factor in self.table.T[1:]:
             values *= columns[factor]
-        own, *derivatives = self.fractions
+        own, *derivatives = self.weights
         terms, sensitivity = np.stack([own @ values] * 2), np.empty(x.shape)
-        for v, fraction in enumerate(derivatives):
-            slopes = fraction @ values
+        for v, weight in enumerate(derivatives):
+            slopes = weight @ values
             terms[1] += slopes * perturbation[v]
             sensitivity[v] = coef @ slopes
         return terms, sensitivity

@@ -28,14 +28,14 @@ ASIDE = ("experiment", "study", "output", "figures", "thesis", "parallel")
 class About:
     """Description of a run, for its page.
 
-    purpose: of the experiment, in a sentence. asked: settings in words, by name. stated: messages
+    purpose: of the experiment, in a sentence. asked: settings in words, by name. messages: those
     about the data and the steps of the run. provenance: as in provenance.json. config: the resolved
     config, as text.
     """
 
     purpose: str
     asked: Mapping[str, str]
-    stated: Sequence[str]
+    messages: Sequence[str]
     warnings: Sequence[str]
     provenance: Mapping[str, Any]
     config: str
@@ -43,12 +43,12 @@ class About:
     @property
     def data(self) -> str:
         """What was read, in a line; empty if the run did not say it."""
-        return next((text for text in self.stated if text.startswith(DATA)), "")
+        return next((text for text in self.messages if text.startswith(DATA)), "")
 
     @property
     def notes(self) -> list[str]:
         """All other messages."""
-        return [text for text in self.stated if text != self.data]
+        return [text for text in self.messages if text != self.data]
 
     @property
     def command(self) -> str:

@@ -40,7 +40,7 @@ class RunFolder:
     def create(root: Path, experiment: str, *, now: datetime) -> RunFolder:
         """Make `root/experiment/<date>_<time>`, with a suffix if another run took that name.
 
-        Raises OSError, naming a hint, if no folder can be written.
+        Raises OSError, with a hint, if no folder can be written.
         """
         parent = root / experiment
         try:

@@ -59,7 +59,7 @@ class Report:
     summary: dict[str, Any] = field(default_factory=dict)
     headline: dict[str, float] = field(default_factory=dict)
     result: Result | None = None
-    stated: list[str] = field(default_factory=list)
+    messages: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     ends: list[Callable[[], None]] = field(default_factory=list)
 
@@ -152,7 +152,7 @@ class Report:
     def say(self, text: str, *, warning: bool = False) -> None:
         """Print a message at once, on the screen and in run.log, and repeat it on the page."""
         if not warning:
-            self.stated.append(text)
+            self.messages.append(text)
         self.screen.print(*renderables(Text(text, warning=warning)))
 
     def warn(self, text: str) -> None:
@@ -218,7 +218,7 @@ class Report:
         return About(
             purpose=purpose,
             asked=settings_used(self.settings, keys),
-            stated=self.stated,
+            messages=self.messages,
             warnings=self.warnings,
             provenance=self.provenance,
             config=(self.folder.path / "config.yaml").read_text("utf-8"),

@@ -37,18 +37,18 @@ N_ERRORS = 2.0
 class WindowsLeftOut:
     """Errors of systems on windows that share no samples with those that they were refined on.
 
-    For assessing, coefficients are held and each window's start is fitted: from a smoothed start
-    even the true system, if it is chaotic, runs away from its own samples. The error is the mean
-    square distance to the samples in variances of each state, averaged over the states with weights
-    1 / residual of the leader, the system of greatest likelihood. It is at most 10, which also
-    stands for a window that a system cannot run through. A refinement that blows up, or that does
-    not converge and follows its own windows no better, keeps the coefficients of the regression,
-    which are assessed like any other. Its bound is two standard errors above the leader's. The
-    standard error is that of the difference between the two errors, in which noise that both meet
-    cancels: with n independent residuals an excess fraction of q in the error has the standard
-    error sqrt(4 q / n), so q = 16 / n is two of them. n is the number of residuals times (1 - rho)
-    / (1 + rho), rho being the autocorrelation of the leader's residuals from sample to sample. So
-    differences between models that miss more than white noise are uncertain.
+    To assess a system, its coefficients are held and each window's start is fitted: from a smoothed
+    start even the true system, if it is chaotic, runs away from its own samples. The error is the
+    mean square distance to the samples in variances of each state, averaged over the states with
+    weights 1 / residual of the leader, the system of greatest likelihood. It is at most 10, which
+    also stands for a window that a system cannot run through. A refinement that blows up, or that
+    does not converge and follows its own windows no better, keeps the coefficients of the
+    regression, which are assessed like any other. Its bound is two standard errors above the
+    leader's. The standard error is that of the difference between the two errors, in which noise
+    that both meet cancels: with n independent residuals an excess fraction of q in the error has
+    the standard error sqrt(4 q / n), so q = 16 / n is two of them. n is the number of residuals
+    times (1 - rho) / (1 + rho), rho being the autocorrelation of the leader's residuals from sample
+    to sample. So differences between models that miss more than white noise are uncertain.
 
     runs: the records between their gaps. spread: standard deviation of each state over all runs.
     n_windows: that are assessed, over all records, each in one fold.
@@ -122,8 +122,8 @@ class WindowsLeftOut:
         """Errors in units of their bound, zero up to the bound, as those systems are alike."""
         errors, bound = _errors_and_bound(np.concatenate(tried, axis=1))
         unknown = np.full_like(errors, np.nan)
-        fractions = np.where(errors > bound, np.minimum(errors / bound, MAX_ERROR), 0.0)
-        return np.column_stack([fractions, unknown, unknown, errors, errors])
+        ratios = np.where(errors > bound, np.minimum(errors / bound, MAX_ERROR), 0.0)
+        return np.column_stack([ratios, unknown, unknown, errors, errors])
 
     def confirm(self, trial: Trial, model: SparseModel) -> ConfirmedSystem:
         """A system is confirmed if its coefficients, refined on all data, meet the demands."""

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from ep2sindy.data.coerce import DiscoveryProblem, noise_inside
 from ep2sindy.data.numbers import column_norms
 from ep2sindy.library.relations import Place, Process
-from ep2sindy.library.roles import Roles, constraint_of, fractions_of
+from ep2sindy.library.roles import Roles, constraint_of, process_matrix
 from ep2sindy.regression.constrained import MIN_RESIDUAL
 from ep2sindy.regression.front import ParetoFront, fit_supports
 from ep2sindy.regression.gram_kernels import fit_masks
@@ -88,10 +88,10 @@ def _join_rows(
     library, columns, targets = task.library, [], []
     for problem in problems:
         for k, state in enumerate(problem.equations):
-            fractions = np.array(
+            factors = np.array(
                 [[p.factors.get((state, term), 0.0) for p in processes] for term in library.names]
             )
-            if not fractions.any():
+            if not factors.any():
                 continue  # the whole equation is known
             fixed = np.array([known.get((state, term), 0.0) for term in library.names])
             target = problem.scaled_target(k)
@@ -99,7 +99,7 @@ def _join_rows(
             left = target - theta @ LeastSquares.of_rows(theta, target).coef
             std = max(float(left.std()), MIN_RESIDUAL * float(np.sqrt(np.square(target).mean())))
             theta = theta / problem.coef_scale(k) / std
-            columns.append(theta @ fractions)
+            columns.append(theta @ factors)
             targets.append(target / std - theta @ fixed)
     return np.concatenate(columns), np.concatenate(targets)
 
@@ -140,12 +140,12 @@ def _build_system(
     means: Float[np.ndarray, " processes"] | None,
 ) -> TrialSystem | None:
     """The system of these processes; None if its coefficients do not tell them apart."""
-    held = constraint_of(task.library, task.states, processes, roles.stated)
+    held = constraint_of(task.library, task.states, processes, roles.known_processes)
     if held is None:
         return None
     known = roles.known
-    stated = np.array([known.get(held.coefficients[k], 0.0) for k in held.free])
-    return TrialSystem.of(task, held, fractions_of(held) @ values + stated, means)
+    fixed = np.array([known.get(held.coefficients[k], 0.0) for k in held.free])
+    return TrialSystem.of(task, held, process_matrix(held) @ values + fixed, means)
 
 
 def _average_terms(

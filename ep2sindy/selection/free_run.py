@@ -296,7 +296,7 @@ class CycleRuns:
     smoothed: Sequence[Float[np.ndarray, "_ n_states"]]
     cycles: Sequence[Cycle]
     bounds: FreeRunBounds
-    n_reweights = 0  # scale states by their standard deviation, as in the assessing
+    n_reweights = 0  # scale states by their standard deviation, as in the assessment
 
     @cached_property
     def window(self) -> int:

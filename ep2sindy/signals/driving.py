@@ -29,18 +29,17 @@ BY_CHANCE = 0.01  # most probability that a frequency which nobody chose is roun
 CLOCK = 2e-5  # relative error of a quartz clock, in the record's times or in the drive's
 N_ERRORS = 2.0  # standard errors of a frequency within which it counts as another
 # A grid wanders by 1e-3. Larger errors than three times that would meet one frequency in a hundred.
-MAINS_Hz, MAINS_ERROR, MAINS_STATED = (50.0, 60.0, 100.0, 120.0), 1e-3, 3e-3
+MAINS_Hz, MAINS_ERROR, MAINS_MOST = (50.0, 60.0, 100.0, 120.0), 1e-3, 3e-3
 # A year has 365 to 365.25 days. Two decades hold three periods: an error of 0.02 is rarely met.
-CALENDAR, CALENDAR_ERROR, CALENDAR_STATED = ("day", "year"), 1e-3, 0.02
+CALENDAR, CALENDAR_ERROR, CALENDAR_MOST = ("day", "year"), 1e-3, 0.02
 
 # Fewest periods in which a phase that returns is distinguished from one that walks.
 MIN_PERIODS_OF_PHASE = 20
 # Mean square of a random walk of n unit steps about its best line, over n: one in a hundred walks
 # of twenty steps is below this, and fewer of longer ones (simulated).
 LEAST_WALK = 0.0147
-LEAST_MOVES = (
-    4.0  # least square of a phase's moves over that of noise, of twenty moves: five errors
-)
+# Least square of a phase's moves over that of noise, of twenty moves: five errors.
+LEAST_MOVES = 4.0
 MISSED = 1.64  # of white noise: its variance, and that between the other samples, of 0.64
 N_POINTS = 64  # in a period, between samples by cubic splines
 SETTLED = 3  # a phase is looked at after the first of so many parts of a record, a transient
@@ -49,10 +48,8 @@ HELD, SWEPT, SINE = "held between steps", "a triangle or a sweep", "a sine"
 RESTING = 0.5  # least fraction of steps in which a held column rests
 LEAP = 0.1  # least median move of a held column, as a fraction of its range: no coarse scale
 EVEN = 0.05  # most distance of a sweep's values from an even spread; a sine's is 0.1
-PURE, PURER = (
-    2.5e-3,
-    20.0,
-)  # largest fraction that is no sine in one, and least ratio to the others'
+# Largest fraction that is no sine in one, and least ratio to the others'.
+PURE, PURER = 2.5e-3, 20.0
 FORETOLD = 0.1  # least fraction of the error of a forecast that a drive takes away
 N_AHEAD, N_LAGS = 12, 3  # steps in a period, and how many of them, by which a signal is foretold
 
@@ -237,10 +234,10 @@ def _looks_driven(signal: Signal) -> tuple[str, float] | None:
 def _round_number(f_Hz: float, error: float, clock: Clock) -> tuple[str, float] | None:
     """The round frequency that one of this relative error is, in words and Hz; None for none."""
     known = [(f"one per {unit}", 1.0 / seconds_in(unit)) for unit in CALENDAR]
-    limits = [(CALENDAR_ERROR, CALENDAR_STATED)] * len(known)
+    limits = [(CALENDAR_ERROR, CALENDAR_MOST)] * len(known)
     if clock.unit == "s":
         known += [(f"{own_Hz:g} Hz, as of the mains,", own_Hz) for own_Hz in MAINS_Hz]
-        limits += [(MAINS_ERROR, MAINS_STATED)] * len(MAINS_Hz)
+        limits += [(MAINS_ERROR, MAINS_MOST)] * len(MAINS_Hz)
     for (words, own_Hz), (least, most) in zip(known, limits, strict=True):
         if abs(f_Hz / own_Hz - 1.0) < error + least < most:
             return words, own_Hz

@@ -314,12 +314,11 @@ def embed_alike(
 def _check_positive(signal: Signal) -> None:
     if signal.is_positive:
         return
-    fraction = 100.0 * float((signal.x <= 0.0).mean())
+    percentage = 100.0 * float((signal.x <= 0.0).mean())
     raise ValueError(
         f"a growth rate needs a positive signal: {signal.name} falls to {signal.x.min():.4g} "
-        f"{signal.unit}, {fraction:.2g} % of its samples are zero or less, and noise does not "
-        "explain "
-        "it; take its derivative instead (derivative), or an offset out of it"
+        f"{signal.unit}, {percentage:.2g} % of its samples are zero or less, and noise does not "
+        "explain it; take its derivative instead (derivative), or an offset out of it"
     )
 
 

@@ -235,9 +235,8 @@ def _check_oscillation(signal: Signal) -> None:
         raise ValueError(
             f"a trace must be sampled {MIN_SAMPLES:g} times a period or more: {name} has "
             f"{signal.per_period:.1f} samples to a period of "
-            f"{clock.duration_text(signal.period_s, digits=4)}, so that all above "
-            f" its harmonic number {signal.per_period / 2.0:.1f} is aliased to lower "
-            "frequencies; sample faster"
+            f"{clock.duration_text(signal.period_s, digits=4)}, so that all above its harmonic "
+            f"number {signal.per_period / 2.0:.1f} is aliased to lower frequencies; sample faster"
         )
 
 

@@ -482,8 +482,7 @@ def scale_steps(
     if len(t) < least or len(values) != len(t):
         raise ValueError(
             f"smoothing needs at least {least} samples, one row of values per time, got "
-            f"{len(values)} "
-            f"rows with {len(t)} times; join more data"
+            f"{len(values)} rows with {len(t)} times; join more data"
         )
     check_time(t)
     step_s = float(t[-1] - t[0]) / (len(t) - 1)
@@ -510,13 +509,13 @@ def _covariance(steps: Float[np.ndarray, " steps"]) -> Float[np.ndarray, "four d
     A difference is the mean of the third derivative under a quadratic B-spline over its three
     steps. Products of two are of degree four, so three Gauss nodes a step integrate them.
     """
-    nodes, fractions = np.polynomial.legendre.leggauss(3)
+    nodes, gauss = np.polynomial.legendre.leggauss(3)
     x, y = 0.5 * (1.0 + nodes), 0.5 * (1.0 - nodes)
     one, two, three = steps[:-2, None], steps[1:-1, None], steps[2:, None]
     before, after, whole = one + two, two + three, one + two + three
     middle = (one + two * x) * y / before + (three + two * y) * x / after
     splines = np.stack([one * x**2 / before, middle, three * y**2 / after]) * 3.0 / whole
-    weights = 0.5 * fractions * np.stack([one, two, three])
+    weights = 0.5 * gauss * np.stack([one, two, three])
     covariance = np.zeros((4, len(one)), order="F")  # as LAPACK takes it
     for k in range(min(3, len(one))):  # difference i + k begins where step k of i does
         n = len(one) - k

@@ -61,9 +61,8 @@ class Study:
         fractions = "; ".join(f"{name} {fraction:.0f} %" for name, fraction in percent.items())
         report.found(
             Result(
-                f"Found: {percent.idxmax()} identifies {self.system.name} at the largest "
-                "fraction of "
-                f"sampling rates and durations, {percent.max():.0f} %",
+                f"Found: {percent.idxmax()} identifies {self.system.name} at the largest fraction "
+                f"of sampling rates and durations, {percent.max():.0f} %",
                 [Text(f"identified: {fractions}")],
                 load='pandas.read_csv("{}/tables/points.csv")',
                 picture="frontier",

@@ -287,9 +287,8 @@ def _add_left_out(report: Report, found: FoundLaw) -> None:
     report.table("left_out", ResultTable(found.runs, metrics), note=LEFT_OUT)
     if not found.statistics["n_sustained"]:
         report.warn(
-            f"none of {len(found.runs)} points left out is sustained by the law of the others, "
-            "so it "
-            "predicts none between them: try points that lie closer together, other models, or "
+            f"none of {len(found.runs)} points left out is sustained by the law of the others, so "
+            "it predicts none between them: try points that lie closer together, other models, or "
             "models=null, longer records, and inputs that are states (docs/points.md)"
         )
 

@@ -59,9 +59,7 @@ from ep2sindy.studies.views import PlotRange, add_figures, add_samples
 from ep2sindy.trust.user_code import load_user_module
 
 FIGURES = ("data", "trajectories", "derivatives", "phase")
-HELD_OUT = (
-    0.25  # fraction of a record on which a self-sustained model is tested, unless a config says
-)
+HELD_OUT = 0.25  # fraction of a record that tests self-sustained models, unless a config says
 _FROM_MODULE = re.compile(r"(?P<module>[^\W\d][\w.]*)\.(?P<name>[^\W\d]\w*)(?P<argument>\(.*\))?")
 
 

@@ -197,9 +197,8 @@ def nothing_moves(statuses: Sequence[str]) -> str:
     """Why there is nothing to fit where no point oscillates, and what to try."""
     return (
         f"none of the {len(statuses)} operating points oscillates "
-        f"({', '.join(sorted(set(statuses)))}), so there is no fit: "
-        "try the part of the records behind the start-up "
-        "('prepare=[{_target_:ep2sindy.data.crop,start_s:...}]'), another zone "
+        f"({', '.join(sorted(set(statuses)))}), so there is no fit: try the part of the records "
+        "behind the start-up ('prepare=[{_target_:ep2sindy.data.crop,start_s:...}]'), another zone "
         "(trajectory.zone.z=...), or other points"
     )
 

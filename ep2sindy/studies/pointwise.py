@@ -93,8 +93,7 @@ class Study:
         if not isinstance(self.method, Regression):
             raise ValueError(
                 "a search of trajectories fits them whole, and a pointwise study searches rows, "
-                "got "
-                f"{self.method!r}; use Regression(search=BestSubset()) (search=best_subset)"
+                f"got {self.method!r}; use Regression(search=BestSubset()) (search=best_subset)"
             )
         return PointSearch(self.states, library, self.method, self.least_variation, seed)
 

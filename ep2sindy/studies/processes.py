@@ -50,12 +50,12 @@ class FittedRate:
     r2: float = float("nan")
 
 
-def stated_roles(balances: Mapping[str, xr.Dataset], run: Trajectory) -> dict[str, FittedRate]:
+def fit_roles(balances: Mapping[str, xr.Dataset], run: Trajectory) -> dict[str, FittedRate]:
     """What the balances of zones tell about roles, over the samples of a run.
 
     balances: by zone, from `ep.thruster.zone_balance`; a single one is called "". The inflow is the
     mean supply of neutrals. In a single zone the neutrals that leave, and what walls and anode give
-    back, are stated by least squares. A role that a balance does not give is left out.
+    back, are fitted by least squares. A role that a balance does not give is left out.
     """
     found = {}
     for zone, balance in balances.items():
@@ -138,7 +138,7 @@ def compared_processes(
     held_to: the model's constraint, from a search under `Roles`. Rates are those of the zone that
     gives, or takes from outside. Where ions give back by a process of their own, ionization is the
     whole of it; else what is given back is subtracted, as the model's terms are net of it. So is
-    what leaves of a state for which the model has no outflow, unless its inflow is stated.
+    what leaves of a state for which the model has no outflow, unless its inflow is known.
     """
     theta = model.library.evaluate(data.columns(model.library.variables))
     found: dict[tuple[str, str], dict[str, float]] = {}
@@ -146,13 +146,13 @@ def compared_processes(
         found.setdefault(ends_of(process), {})[process.term] = amount
     known = {zone: recorded_rates(balance, data) for zone, balance in zones.balances.items()}
     gone = _through_ends(known, zones.sizes or dict.fromkeys(known, 1.0))
-    stated = {ends_of(process) for process in held_to.known}
+    given = {ends_of(process) for process in held_to.known}
     leaving = {g for g, taker in found if not taker or _zone(g) != _zone(taker)}
     compared = []
     # What enters comes first, what leaves last.
     for ends, terms in sorted(found.items(), key=lambda each: (bool(each[0][0]), not each[0][1])):
         columns = theta[:, [model.library.index(term) for term in terms]]
-        gross = ends[::-1] in found if ends[0] else ends[1] in leaving or ends in stated
+        gross = ends[::-1] in found if ends[0] else ends[1] in leaving or ends in given
         rate = _zone_rate(*ends, known, gone, gross=gross)
         modelled = columns @ np.array([*terms.values()])
         beside = fitted_rate(rate, columns, list(terms)) if rate is not None else FittedRate({})

@@ -25,13 +25,12 @@ MOST_LAWS = 3  # on the screen
 LEAST_POINTS = 3  # of a control law
 
 INTERVALS = (
-    "Intervals of 95 % are sandwiches: of least squares with blocks of two periods as "
-    "clusters, of refinements with windows. It says how far another segment of the same record "
-    "would move a value, not how far the model is from the discharge: compare R2, and the fits. "
-    "Nor does it hold the bias that smoothing and differencing leave in least squares, even "
-    "without noise, which may be many times as large; refinements differentiate nothing. Refined "
-    "models follow trajectories: R2 is that of the derivative, and may be negative where pulses "
-    "are sharp."
+    "Intervals of 95 % are sandwiches: of least squares with blocks of two periods as clusters, of "
+    "refinements with windows. It says how far another segment of the same record would move a "
+    "value, not how far the model is from the discharge: compare R2, and the fits. Nor does it "
+    "hold the bias that smoothing and differencing leave in least squares, even without noise, "
+    "which may be many times as large; refinements differentiate nothing. Refined models follow "
+    "trajectories: R2 is that of the derivative, and may be negative where pulses are sharp."
 )
 CONTROL = (
     "Errors are RMS over the mean, at points left out: of the law's terms, fitted without the "
@@ -121,8 +120,7 @@ def read_published(published: Published, parameters: Sequence[str]) -> pd.DataFr
         if not set(parameters) < set(columns) or len({*map(len, columns.values())}) > 1:
             raise ValueError(
                 f"thesis must give {list(parameters)} and quantities at every point, or be null, "
-                "got "
-                f"{dict(columns)} for {fit}"
+                f"got {dict(columns)} for {fit}"
             )
         for name in columns:
             if name not in parameters:

@@ -64,10 +64,10 @@ def _prepared(data: Deferred, prepare: Sequence[Step]) -> xr.Dataset:
         warnings.simplefilter("ignore", DoubtfulUnit)  # the warning comes once, for the data used
         field: xr.Dataset = data.build()
     check_recorded(field)
-    stated = dict(field.attrs)
+    attrs = dict(field.attrs)
     for step in prepare:
         field = step(field)
-    return field.assign_attrs(stated | field.attrs)
+    return field.assign_attrs(attrs | field.attrs)
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,10 +247,10 @@ def in_unit(field: xr.Dataset, *, signal: str, unit: str) -> xr.Dataset:
     """
     if signal not in field:
         return field  # the trajectory reports what the data hold
-    if (stated := field[signal].attrs.get("units", "1")) != "1":
+    if (own := field[signal].attrs.get("units", "1")) != "1":
         raise ValueError(
             f"unit is for a signal whose unit the data do not say: {signal} comes in "
-            f"{stated!r}, got unit={unit}; leave unit out, or describe the file by data=file"
+            f"{own!r}, got unit={unit}; leave unit out, or describe the file by data=file"
         )
     return field.assign({signal: to_si(field[signal], signal, unit, is_variable=True)})
 

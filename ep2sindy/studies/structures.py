@@ -13,10 +13,10 @@ import numpy as np
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library, named_terms, polynomial
 from ep2sindy.library.relations import Constraint, constraint
-from ep2sindy.library.roles import Roles, constraint_of, fractions_of, sum_known
+from ep2sindy.library.roles import Roles, constraint_of, process_matrix, sum_known
 from ep2sindy.library.terms import variables_of
 from ep2sindy.model.model import SparseModel, model_of
-from ep2sindy.studies.processes import Zones, compared_processes, ends_of, stated_roles
+from ep2sindy.studies.processes import Zones, compared_processes, ends_of, fit_roles
 from ep2sindy.studies.study import Check, Coefficients, Terms
 
 ROLES_DEGREE = 3  # of the products that roles are played by
@@ -86,9 +86,11 @@ class Structure:
         if self.roles is None:
             terms = {state: list(map(str, self.terms[state])) for state in states}
             return constraint(library, terms, self.relations if relations else ())
-        stated = stated_roles(zones.balances, run)
-        roles = self.roles.with_known({name: rate.terms for name, rate in stated.items()})
-        held = constraint_of(library, states, roles.processes(library, states), roles.stated)
+        rates = fit_roles(zones.balances, run)
+        roles = self.roles.with_known({name: rate.terms for name, rate in rates.items()})
+        held = constraint_of(
+            library, states, roles.processes(library, states), roles.known_processes
+        )
         if held is None:
             raise ValueError(f"the coefficients of {states} do not tell these roles apart: {roles}")
         return held
@@ -119,11 +121,10 @@ def balance_model(library: Library, held: Constraint, run: Trajectory, zones: Zo
     if not asked or not {*asked} <= {*found}:
         raise ValueError(
             "coefficients of the balance need processes that the record tells, by roles: asked for "
-            f"{asked}, stated are {[*found]}; take roles, and the zone of a simulated thruster "
-            "from "
-            "its anode on"
+            f"{asked}, the record tells {[*found]}; take roles, and the zone of a simulated "
+            "thruster from its anode on"
         )
     values = [found[each] for each in asked]
     known, places = sum_known(held.known), [held.coefficients[k] for k in held.free]
-    z = fractions_of(held) @ np.array(values) + [known.get(place, 0.0) for place in places]
+    z = process_matrix(held) @ np.array(values) + [known.get(place, 0.0) for place in places]
     return model_of(library, held.equations(z), units=run.units)

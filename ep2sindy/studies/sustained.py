@@ -32,7 +32,7 @@ from ep2sindy.selection.criteria import Selection
 from ep2sindy.signals.attractor import find_cycle, mean_cycle, white_variance
 from ep2sindy.signals.smoothers import KalmanSmoother
 from ep2sindy.signals.spectrum import power_spectrum, samples_in_periods
-from ep2sindy.studies.processes import NO_ZONES, TELLING, Zones, stated_roles
+from ep2sindy.studies.processes import NO_ZONES, TELLING, Zones, fit_roles
 from ep2sindy.studies.study import Count, Positive
 from ep2sindy.studies.views import CYCLE, add_samples
 
@@ -70,9 +70,8 @@ class SustainedSearch:
     def __post_init__(self) -> None:
         if self.selection.basis != "runs":
             raise ValueError(
-                "whether a model sustains its oscillation shows when it runs: selection must be "
-                "a rule that runs models, "
-                f"such as FreeRunScore(), got {self.selection!r}"
+                "whether a model sustains its oscillation shows when it runs: selection must be a "
+                f"rule that runs models, such as FreeRunScore(), got {self.selection!r}"
             )
 
     def found(
@@ -92,29 +91,30 @@ class SustainedSearch:
         """
         own = replace(rows, search=self.search, depth=self.depth, selection=self.selection)
         library = polynomial(train.state_names, degree=self.degree) if self.degree else library
-        roles, stated = self._stated(train, zones)
+        roles, about = self._roles_of(train, zones)
         seen, words = self._quiet(train)
         found = discover(seen, library.with_roles(roles), own, seed=rng, progress=progress)
-        found = replace(found, note=f"{found.note}{stated}")
+        found = replace(found, note=f"{found.note}{about}")
         if not words:
             return found
         # The noise is gone from the samples, and with it what intervals are made of.
         model = replace(found.model, covariance=None)
         return replace(found, model=model, note=f"{words}{found.note}")
 
-    def _stated(self, train: Trajectory, zones: Zones) -> tuple[Roles | None, str]:
+    def _roles_of(self, train: Trajectory, zones: Zones) -> tuple[Roles | None, str]:
         """The roles with what the record tells, and how well it tells what is fitted to it."""
         if self.roles is None:
             return None, ""
         roles = self.roles.in_zones(zones.sizes) if zones.sizes else self.roles
-        stated = stated_roles(zones.balances, train)
-        fitted = [role for role in roles.open if role in stated and role in TELLING]
-        known = {name: role.terms for name, role in stated.items()}
+        rates = fit_roles(zones.balances, train)
+        fitted = [role for role in roles.open if role in rates and role in TELLING]
+        known = {name: role.terms for name, role in rates.items()}
         words = (
-            f"{name} by {', '.join(stated[name].terms)} (R2 {stated[name].r2:.3f})"
-            for name in fitted
+            f"{name} by {', '.join(rates[name].terms)} (R2 {rates[name].r2:.3f})" for name in fitted
         )
-        return roles.with_known(known), f"; stated: {', '.join(words)}" if fitted else ""
+        return roles.with_known(
+            known
+        ), f"; fitted to the record: {', '.join(words)}" if fitted else ""
 
     def _quiet(self, train: Trajectory) -> tuple[Trajectory, str]:
         """What the search sees of a record, and why, if that is its mean cycle."""

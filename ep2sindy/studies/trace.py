@@ -121,7 +121,7 @@ class Study:
             raise ValueError(f"offset must be a number or fit, got {self.offset!r}")
 
     @property
-    def stated(self) -> StatedFacts:
+    def facts(self) -> StatedFacts:
         """What is known of the equations."""
         barred = {
             state: [str(name) for name in names] for state, names in (self.exclude or {}).items()
@@ -132,7 +132,7 @@ class Study:
         field, data = self._sampled(report)
         with resumed(self.keep, report) as keeping:
             signal = self._prepared(data, keeping.once, report)
-            self.stated.check(self.tried, signal)
+            self.facts.check(self.tried, signal)
             past = fitted_part(signal, self.held_out)
             linear = is_linear(past)
             if linear:
@@ -141,7 +141,7 @@ class Study:
             if question := ask_whether_driven(signal, beside):
                 report.warn(question)
             attempts = try_in_turn(
-                past, self.tried, self.method, stated=self.stated, linear=linear,
+                past, self.tried, self.method, facts=self.facts, linear=linear,
                 seed=report.seed, progress=report.watch, once=keeping.once,
             )  # fmt: skip
         best = best_of(attempts)
@@ -274,7 +274,7 @@ def _add_signal(
     per_period = signal.period_s / states.dt_s
     turns = "periods" if signal.cycle is not None else "turns, which do not repeat themselves,"
     too_fast = "" if embedding.how == "hidden" else ", and what is too fast to be followed"
-    fraction = 100.0 * best.noise_std / signal.x.std()
+    percentage = 100.0 * best.noise_std / signal.x.std()
     noise = f"{best.noise_std:.3g} {signal.unit}".removesuffix(" 1")
     moves = ", ".join(f"{state} by {size:.2g}" for state, size in best.process_noise_std.items())
     exact = ", ".join(f"{state}' = {term.replace('*', ' ')}" for state, term in known.items())
@@ -284,7 +284,7 @@ def _add_signal(
         f"{per_period:.0f} samples",
         f"states: {embedding.says}, {', '.join(states.state_names)} ({best.states.reason})"
         f"{'; known: ' if exact else ''}{exact}",
-        f"noise{too_fast}: {noise}, {fraction:.2g} % of the standard deviation",
+        f"noise{too_fast}: {noise}, {percentage:.2g} % of the standard deviation",
         f"process noise, which moves the states at random in every step: {moves} (SI)",
         *signal.done,
     )

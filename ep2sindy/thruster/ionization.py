@@ -90,9 +90,9 @@ def read_rate_table(
     gaps = [row for row in rows if len(row) < 2 or None in map(number, row)]
     columns = np.array([] if gaps else rows, dtype=np.float64).reshape(-1, 2)
     if len(columns) < 2 or np.any(np.diff(columns[:, 0]) <= 0):
-        stated = f"a row {gaps[0]}" if gaps else f"{len(columns)} rows of numbers"
+        content = f"a row {gaps[0]}" if gaps else f"{len(columns)} rows of numbers"
         raise ValueError(
             f"a rate table must have two columns, T_e in eV (increasing) and rate in m^3/s, and "
-            f"two rows or more: {path} has {stated}"
+            f"two rows or more: {path} has {content}"
         )
     return columns[:, 0], columns[:, 1]

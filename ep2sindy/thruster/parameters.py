@@ -91,8 +91,7 @@ class ModulatedVoltage:
         if self.fraction >= 1.0:
             raise ValueError(
                 "ModulatedVoltage.fraction must be below 1, or the supply turns round, got "
-                f"{self.fraction:g}"
-                "; 0.05 is five per cent"
+                f"{self.fraction:g}; 0.05 is five per cent"
             )
 
     def at(self, t: Volts, voltage: float) -> Volts:

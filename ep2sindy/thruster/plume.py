@@ -2,7 +2,7 @@
 
 Both plumes spread between two cones: at a distance x beyond the exit, the outer radius has grown by
 h and the inner one has shrunk by h, to zero at least, where dh/dx is the tangent of the half-angle
-there. They fraction `tangents`.
+there. They share `tangents`.
 """
 
 from __future__ import annotations

@@ -58,8 +58,8 @@ def read_hdf5(path: Path) -> FileSource:
     names = names_in_hdf5(path)
     beside = {name: array for name, array in beside.items() if name not in names}
     with h5py.File(path) as file:
-        stated = {key: _plain(value) for key, value in file.attrs.items()}
-    numbers = {key: value for key, value in stated.items() if isinstance(value, int | float)}
+        attributes = {key: _plain(value) for key, value in file.attrs.items()}
+    numbers = {key: value for key, value in attributes.items() if isinstance(value, int | float)}
     return FileSource(path, [*names, *beside], read, attributes=numbers)
 
 
@@ -110,8 +110,8 @@ def _mesh(name: str, item: h5py.Group | h5py.Dataset) -> dict[str, xr.DataArray]
 
 def _has_modes(found: h5py.Dataset) -> bool:
     """True for a record of openPMD whose first axis holds azimuthal modes."""
-    stated = (each.attrs.get("geometry") for each in (found, found.parent))
-    return "thetaMode" in (_plain(geometry) for geometry in stated)
+    geometries = (each.attrs.get("geometry") for each in (found, found.parent))
+    return "thetaMode" in (_plain(geometry) for geometry in geometries)
 
 
 def _openpmd_unit(attributes: h5py.AttributeManager) -> str:
@@ -211,15 +211,15 @@ def _attributes(found: h5py.Dataset, name: str) -> dict[str, Any]:
 
     An empty attribute means no unit; raises ValueError for an empty packing attribute.
     """
-    stated = {key: _plain(found.attrs[key]) for key in (*PACKING, *UNITS) if key in found.attrs}
-    attrs = {key: stated[key] for key in PACKING if key in stated}
+    given = {key: _plain(found.attrs[key]) for key in (*PACKING, *UNITS) if key in found.attrs}
+    attrs = {key: given[key] for key in PACKING if key in given}
     if empty := [key for key, value in attrs.items() if value is None]:
         raise ValueError(
             f"{empty[0]} of {name!r} must be a number: the attribute is empty, its dataspace is "
             "null; give it a value, or take it away"
         )
     check_packing(name, attrs)
-    units = next((stated[key] or "" for key in UNITS if key in stated), "")
+    units = next((given[key] or "" for key in UNITS if key in given), "")
     return attrs | {"units": units or _openpmd_unit(found.attrs)}
 
 

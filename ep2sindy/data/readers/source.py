@@ -194,9 +194,9 @@ def dataset_source(path: Path, dataset: xr.Dataset) -> FileSource:
             array.compute()  # damage shows here, where the error names the file; result not kept
         return array
 
-    stated = {str(key): plain(value) for key, value in dataset.attrs.items()}
-    stated = {key: value for key, value in stated.items() if isinstance(value, str | int | float)}
-    return FileSource(path, [*stored], read, dims_named=True, channel_m=length, attributes=stated)
+    attrs = {str(key): plain(value) for key, value in dataset.attrs.items()}
+    attrs = {key: value for key, value in attrs.items() if isinstance(value, str | int | float)}
+    return FileSource(path, [*stored], read, dims_named=True, channel_m=length, attributes=attrs)
 
 
 def column_array(column: pd.Series, unit: str) -> xr.DataArray:

@@ -175,8 +175,8 @@ def _decimal(cells: Sequence[str], separator: str | None, rated: str) -> str:
 def _is_row(cells: Sequence[str], columns: Sequence[int], decimal: str) -> bool:
     """True if all numeric columns hold numbers or notations for missing samples, and one at all."""
     at = [cells[j] if j < len(cells) else "" for j in columns]
-    stated = any(cell.strip("-") for cell in at)
-    return stated and all(NUMBERS[decimal].fullmatch(c) or c.lower() in MISSING for c in at)
+    has_numbers = any(cell.strip("-") for cell in at)
+    return has_numbers and all(NUMBERS[decimal].fullmatch(c) or c.lower() in MISSING for c in at)
 
 
 def _first_row(
@@ -261,10 +261,10 @@ def header_of(
         return numbered
     if not has_units and not is_comment:
         _check_names(above)
-    stated = [_unit(cell) for cell in units]
-    header = split_names(names, [*stated, *[""] * n_columns][:n_columns])
+    own = [_unit(cell) for cell in units]
+    header = split_names(names, [*own, *[""] * n_columns][:n_columns])
     if header.names[0].lower() in TIMES and not any(header.units):
-        header = replace(header, units=_stated_units(above, n_columns))
+        header = replace(header, units=_preamble_units(above, n_columns))
     return replace(header, step_s=step_s)
 
 
@@ -295,12 +295,12 @@ def _labels_beside(header: Header, rows: Sequence[Sequence[str]], columns: Seque
     Older oscilloscopes of Tektronix write it there, one line in each row.
     """
     labels = [row[: columns[0]] for row in rows]
-    units = dict(zip(columns, _stated_units(labels, len(columns)), strict=True))
-    stated = tuple(units.get(j, "") for j in range(len(header.units)))
-    return replace(header, units=stated, step_s=header.step_s or _step_s(labels))
+    by_column = dict(zip(columns, _preamble_units(labels, len(columns)), strict=True))
+    units = tuple(by_column.get(j, "") for j in range(len(header.units)))
+    return replace(header, units=units, step_s=header.step_s or _step_s(labels))
 
 
-def _stated_units(above: Sequence[Sequence[str]], n_columns: int) -> tuple[str, ...]:
+def _preamble_units(above: Sequence[Sequence[str]], n_columns: int) -> tuple[str, ...]:
     """Units of the columns, time first, as lines of a preamble give them; "" where none does."""
     time, values = "", [""]
     for label, *cells in filter(None, above):
@@ -318,7 +318,7 @@ def _stated_units(above: Sequence[Sequence[str]], n_columns: int) -> tuple[str, 
 
 
 def split_names(names: Sequence[str], units: Sequence[str] = ()) -> Header:
-    """Header of columns whose names may hold units, as `Time (s)`; units: stated elsewhere."""
+    """Header of columns whose names may hold units, as `Time (s)`; units: given elsewhere."""
     parted = [split_name(name) for name in names]
     units = units if any(units) else [unit for _, unit in parted]
     return Header(_unique([name for name, _ in parted]), tuple(map(_plain, units)))
@@ -328,8 +328,8 @@ def _step_s(above: Sequence[Sequence[str]]) -> float | None:
     """Time step in s from a preamble, or None."""
     for cells in above:
         if len(cells) > 1 and STEP.fullmatch(cells[0]):
-            stated = cells[1].replace(",", ".")
-            return float(stated) if re.fullmatch(PLAIN["."], stated) else None
+            step = cells[1].replace(",", ".")
+            return float(step) if re.fullmatch(PLAIN["."], step) else None
     return None
 
 
@@ -388,11 +388,11 @@ def _rigol_header(above: Sequence[Sequence[str]], n_columns: int) -> Header | No
     for k, cells in enumerate(above):
         words = [cell.lower() for cell in cells]
         below = dict(zip(words, above[k + 1] if k + 1 < len(above) else [], strict=False))
-        stated = below.get("increment", "")
-        if len(words) > n_columns and re.fullmatch(PLAIN["."], stated):
+        step = below.get("increment", "")
+        if len(words) > n_columns and re.fullmatch(PLAIN["."], step):
             units = [unit if unit_like(unit) else "" for unit in map(_plain, above[k + 1])]
             units += [""] * n_columns
-            return Header(_unique(cells[:n_columns]), tuple(units[:n_columns]), float(stated))
+            return Header(_unique(cells[:n_columns]), tuple(units[:n_columns]), float(step))
     return None
 
 

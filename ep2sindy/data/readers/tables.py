@@ -240,12 +240,12 @@ def read_tdms(path: Path) -> FileSource:
             for channel in group.channels()
         }
         values = {name: np.asarray(channel[:]) for name, channel in channels.items()}
-        stated = {name: dict(channel.properties) for name, channel in channels.items()}
+        properties = {name: dict(channel.properties) for name, channel in channels.items()}
 
     def read(name: str) -> xr.DataArray:
-        return column_array(pd.Series(values[name]), str(stated[name].get(UNIT, "")))
+        return column_array(pd.Series(values[name]), str(properties[name].get(UNIT, "")))
 
-    steps = {float(of[STEP]) for of in stated.values() if of.get(STEP)}
+    steps = {float(of[STEP]) for of in properties.values() if of.get(STEP)}
     return FileSource(
         path, [*values], read, words=f"{len(values)} channels", is_table=True,
         step_s=steps.pop() if len(steps) == 1 else None,

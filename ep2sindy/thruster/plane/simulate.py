@@ -154,8 +154,8 @@ def simulate_as(
     model = build_model(thruster, operating_point, grid)
     n_warm_up, n_samples = round(warm_up_s / sample_s), round(duration_s / sample_s) + 1
     watch = as_progress(progress)
-    with watch.stage(n_warm_up + n_samples, "sample", operating_point.label) as stated:
-        rows = warmed_up_run(grid, model, n_warm_up, n_samples, sample_s, averaged, stated)
+    with watch.stage(n_warm_up + n_samples, "sample", operating_point.label) as advance:
+        rows = warmed_up_run(grid, model, n_warm_up, n_samples, sample_s, averaged, advance)
     field = labelled(rows, sample_s, grid)
     drop = thruster.series_resistance * field["I_d"].values
     field["V_d"] = ("time", operating_point.voltage - drop, notes(*SERIES["V_d"]))
@@ -209,17 +209,17 @@ def warmed_up_run(
     n_samples: int,
     sample_s: float,
     averaged: bool,
-    stated: Advance,
+    advance: Advance,
 ) -> Rows:
     """The samples after the warm-up; if the warm-up diverges, its last finite samples."""
     state = initial_state(grid, model)
     rows = Rows.allocate(min(n_warm_up, CHUNK_ROWS), grid)
-    broken = warm_up(rows.march(state, model, sample_s, averaged), n_warm_up, stated)
+    broken = warm_up(rows.march(state, model, sample_s, averaged), n_warm_up, advance)
     if broken is not None:
         return rows.until(broken)
     rows = Rows.allocate(n_samples, grid)
     return rows.until(
-        record_samples(rows.march(state, model, sample_s, averaged), n_samples, stated)
+        record_samples(rows.march(state, model, sample_s, averaged), n_samples, advance)
     )
 
 
