@@ -116,6 +116,7 @@ def test_every_kind_of_window_has_an_error(tmp_path: Path) -> None:
         ("variants=[STLSQ,weak]", r"must all choose terms, or none of them, got \['STLSQ', 'w"),
         ("variants=[other]", r"unknown variants \['other'\]; there are"),
         ("+grids={other: {a: [1]}}", r"unknown variants \['other'\]; there are"),
+        ("+grids={STLSQ: {depth: [1]}, ours: {depth: [1]}}", "of its own, got 'depth_1' twice"),
         ("variants=[knee]", "has `find`, or a form of the regression, got Knee"),
     ],
 )

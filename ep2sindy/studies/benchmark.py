@@ -103,17 +103,20 @@ def build_variants(
 
     grids: lists of values in place of some settings of a method, each combination of which is a
     method of its own, `n_windows_100_n_points_10`.
-    Raises ValueError for an unknown name, for what is neither a method with `find` nor a form of
-    the regression, or for both kinds together.
+    Raises ValueError for an unknown name or two equal ones, for what is neither a method with
+    `find` nor a form of the regression, or for both kinds together.
     """
     if unknown := [name for name in (*names, *grids) if name not in definitions]:
         raise ValueError(f"unknown variants {unknown}; there are {list(definitions)}")
     variants: dict[str, Variant | Formulation] = {}
     for name in names:
-        lists = {at: node for at, node in nodes_of(grids.get(name)) if isinstance(node, list)}
+        nodes = {at: node for at, node in nodes_of(grids.get(name)) if "[" not in at}
+        lists = {at: node for at, node in nodes.items() if isinstance(node, list) and node}
         for values in product(*lists.values()):
             places = dict(zip(lists, values, strict=True))
             label = "_".join(f"{at.rpartition('.')[2]}_{value}" for at, value in places.items())
+            if (label or name) in variants:
+                raise ValueError(f"each variant needs a name of its own, got {label!r} twice")
             variants[label or name] = variant = definitions[name].changed(places).build()
             if not isinstance(variant, Variant | Formulation):
                 raise ValueError(
