@@ -6,7 +6,7 @@ unexport PYTHONDONTWRITEBYTECODE
 # Tests that call all rooms, for `make types`; another set: make types TYPED=tests/test_weak.py
 TYPED := $(patsubst %,tests/test_%.py,types files numbers fields inspection kalman \
 	propellants axial plane thruster model simulation forecast datasets weak constraints search systems given \
-	control_law refine operating_plots map_plots plots sklearn report compare experiment_frontier)
+	control_law refine operating_plots map_plots plots sklearn report compare experiment_benchmark)
 
 .PHONY: breathing test test-fast test-slow test-lowest test-docs lint types docs docs-numbers benchmark clean
 

@@ -79,7 +79,7 @@ def on_attractor(name: str, rng: np.random.Generator) -> System:
 
 
 def collected_draw(
-    name: str,
+    system: str,
     noise: float,
     number: int,
     *,
@@ -88,10 +88,10 @@ def collected_draw(
     seed: int = 0,
 ) -> tuple[System, list[Trajectory]]:
     """As `ep2sindy.systems.draws.realization`, of a system of the collection."""
-    rng = np.random.default_rng([seed, *name.encode(), number])
-    system = on_attractor(name, rng)
-    starts = [on_attractor(name, rng).initial for _ in range(n_trajectories - 1)]
-    return noisy_records(system, starts, noise, rng, degree=degree)
+    rng = np.random.default_rng([seed, *system.encode(), number])
+    draws = [on_attractor(system, rng) for _ in range(n_trajectories)]
+    starts, streams = [draw.initial for draw in draws], rng.spawn(n_trajectories)
+    return noisy_records(draws[0], starts, streams, noise, degree=degree)
 
 
 def counted(
@@ -105,7 +105,8 @@ def counted(
 ) -> pd.DataFrame:
     """`cells` of all systems together."""
     draw = partial(collected_draw, n_trajectories=n_trajectories, degree=degree)
-    tasks = product(names, noises, range(n))
+    places = product(names, noises, range(n))
+    tasks = [dict(zip(("system", "noise", "number"), place, strict=True)) for place in places]
     rows = [row for task in tasks for row in assessed(variants, draw, task, seed=0)]
     return cells(pd.DataFrame(rows).assign(system="dysts"))
 

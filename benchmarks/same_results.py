@@ -48,7 +48,8 @@ TOYS: dict[str, list[str]] = {
         "fits.boxes.n_points=[10,50]",
     ],
     "weak_windows": [
-        "+exp=weak_windows", "fits.boxes.n_windows=[100,300]", "fits.boxes.n_points=[10,30]",
+        "+exp=weak_windows",
+        "grids.boxes.test_functions={{n_windows: [100,300], n_points: [10,30]}}",
         "noises=[0.0,0.1]", "n_realizations=2", "parallel=serial",
     ],
     "frontier": [

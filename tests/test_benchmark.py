@@ -4,18 +4,28 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pandas as pd
 import pytest
+from numpy import nan
 
+import ep2sindy as ep
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.method import Finding, Regression, TrajectorySearch
 from ep2sindy.library.library import Library
 from ep2sindy.regression.bootstraps import Bootstraps
-from ep2sindy.regression.formulations import Differential
-from ep2sindy.regression.searches import STLSQ, AdaptiveLasso
+from ep2sindy.regression.formulations import Differential, RandomSplit, Weak
+from ep2sindy.regression.searches import STLSQ, AdaptiveLasso, BestSubset
+from ep2sindy.regression.windows import Boxes
 from ep2sindy.runtime.parallel import Serial
 from ep2sindy.runtime.progress import SILENT, Progress, as_progress
 from ep2sindy.selection.criteria import Knee
-from ep2sindy.studies.benchmark import Study, Variant, cells, merits
+from ep2sindy.studies.benchmark import (
+    Study,
+    Variant,
+    cells,
+    coefficient_error,
+    error_cells,
+    merits,
+)
 from ep2sindy.systems.draws import realization
 from ep2sindy.systems.systems import damped_oscillator
 from tests.rules import BySize
@@ -24,6 +34,16 @@ TRUTH = {"x": frozenset({"v"}), "v": frozenset({"x", "v"})}  # of the oscillator
 # Draws random bootstraps and a random split: its outcome hangs on its stream.
 BALASSO = Regression(Differential(), AdaptiveLasso(), Knee(), Bootstraps(n=4))
 STLSQ_ = Regression(Differential(), STLSQ(), Knee(), Bootstraps(n=0))
+UNWEIGHTED = Weak(split=RandomSplit(test_fraction=0.0), errors_in_variables=False)
+SAMPLED = {
+    "systems": [ep.lotka_volterra()], "noises": [0.0], "n_realizations": None,
+    "rates_Hz": [0.1, 2.0, 20.0], "durations_s": [2.0, 50.0],
+}  # fmt: skip
+
+
+def boxes(n_windows: int, n_points: int) -> Weak:
+    windows = Boxes(n_windows=n_windows, n_points=n_points)
+    return replace(UNWEIGHTED, test_functions=windows, smooth_library=False)
 
 
 @dataclass
@@ -47,8 +67,7 @@ def benchmark(
     progress: Progress = SILENT,
     **settings,
 ) -> pd.DataFrame:
-    defaults = {"n_trajectories": 1, "degree": None, "parallel": Serial(), "definitions": {}}
-    study = Study(variants=list(variants), **(defaults | settings))
+    study = Study(variants=list(variants), definitions={}, parallel=Serial(), **settings)
     return study.outcomes(variants, seed=seed, progress=progress)
 
 
@@ -89,15 +108,27 @@ def test_further_trajectories_leave_the_first_as_it_was() -> None:
     assert not np.allclose(first.states[0], second.states[0], atol=0.5)
 
 
-def test_leaving_a_variant_out_changes_no_other() -> None:
+def test_every_variant_has_a_stream_of_its_own() -> None:
     nothing = Finding(kept={"x": [], "y": []}, selected=None)
     alone, beside = Scripted([nothing] * 2), Scripted([nothing] * 2)
     outcomes_of(variants={"scripted": alone})
-    both = outcomes_of(variants={"STLSQ": STLSQ_, "scripted": beside, "BALASSO": BALASSO})
+    outcomes_of(variants={"STLSQ": STLSQ_, "scripted": beside})
     assert alone.drawn == beside.drawn
     assert len(set(alone.drawn)) == 2
-    kept = both[both["variant"] == "BALASSO"].reset_index(drop=True)
-    pd.testing.assert_frame_equal(kept, outcomes_of(variants={"BALASSO": BALASSO}))
+
+
+@pytest.mark.parametrize(
+    ("variants", "settings"),
+    [
+        ({"STLSQ": STLSQ_, "BALASSO": BALASSO}, {}),
+        ({"STLSQ": STLSQ_, "BALASSO": BALASSO}, SAMPLED),
+        ({"automatic": UNWEIGHTED, "boxes": boxes(100, 10)}, {"systems": [ep.lotka_volterra()]}),
+    ],
+)
+def test_leaving_a_variant_out_changes_no_other(variants: dict, settings: dict) -> None:
+    both, last = outcomes_of(variants=variants, **settings), list(variants)[-1]
+    kept = both[both["variant"] == last].reset_index(drop=True)
+    pd.testing.assert_frame_equal(kept, outcomes_of(variants={last: variants[last]}, **settings))
 
 
 def test_known_findings_give_exact_counts() -> None:
@@ -162,3 +193,60 @@ def test_a_wider_library_holds_the_same_model() -> None:
         assert wider.model.terms(state) == system.model.terms(state)
     with pytest.raises(ValueError, match=r"terms of Lorenz, of degree 2 or more, got degree=1"):
         realization("lorenz", 0.0, 0, degree=1)
+
+
+def test_long_and_fast_samples_identify_and_few_do_not() -> None:
+    plain = Regression(Differential(smooth_library=False), BestSubset(max_terms=3), Knee())
+    points = outcomes_of(variants={"plain": plain}, **SAMPLED).set_index(["rate_Hz", "duration_s"])
+    # Never less identified for being longer; and what could not run, was not.
+    assert points["on_front"].to_dict() == pytest.approx(
+        {(20, 50): 1, (20, 2): 1, (2, 50): 1, (2, 2): nan, (0.1, 50): nan, (0.1, 2): nan},
+        nan_ok=True,
+    )
+    assert points.loc[(0.1, 2.0), "reason"] == "a trajectory needs two samples: 0 fit in"
+    assert "smoothing needs at least 11 samples" in points.loc[(2.0, 2.0), "reason"]
+    assert points.loc[(20.0, 50.0), "reason"] == ""
+    with pytest.raises(ValueError, match="smoothing needs at least 11 samples"):
+        outcomes_of(variants={"plain": plain}, **SAMPLED | {"rates_Hz": [1], "durations_s": [5]})
+
+
+@pytest.mark.parametrize("n_points", [2, 10])
+def test_without_noise_errors_are_those_of_the_trapezoidal_rule(n_points: int) -> None:
+    rates_Hz = np.array([15.0, 30.0, 60.0])
+    errors = [error_of(boxes(2000, n_points), rate_Hz) for rate_Hz in rates_Hz]
+    # A window's mean is off by dt^2 / 12 (f'(end) - f'(start)) / length, whatever its length.
+    order = np.polyfit(np.log(1.0 / rates_Hz), np.log(errors), 1)[0]
+    assert order == pytest.approx(2.0, abs=0.1)
+    assert errors[1] < (1.0 / 30.0) ** 2 / 12.0
+
+
+def error_of(form: Weak, rate_Hz: float) -> float:
+    system, runs = realization(ep.lotka_volterra(), rate_Hz=rate_Hz, duration_s=40.0)
+    return coefficient_error(form, system, runs, rng=np.random.default_rng(0))
+
+
+def test_without_noise_smooth_windows_find_the_coefficients() -> None:
+    for form in (UNWEIGHTED, replace(UNWEIGHTED, errors_in_variables=True)):
+        # The bump falls to 1e-10 at its edge; the integration has 1e-10.
+        assert error_of(form, 30.0) < 1e-8
+
+
+def errors_of(forms: Mapping[str, Weak], noises: Sequence[float], **settings) -> pd.DataFrame:
+    shared = {"systems": [ep.lotka_volterra()], "rates_Hz": [30.0], "durations_s": [40.0]}
+    return benchmark(forms, noises=noises, **shared, **settings)
+
+
+def test_more_and_longer_windows_bear_more_noise() -> None:
+    forms = {f"{n}_{length}": boxes(n, length) for n in (100, 2000) for length in (10, 100)}
+    means = error_cells(errors_of(forms, [0.0, 0.05], n_realizations=4, seed=1), forms)
+    assert means["n"].tolist() == [4] * 2 * 4
+    noisy = means[means["noise"] == 0.05].set_index(["n_windows", "n_points"])["error_mean"]
+    assert noisy[2000, 100] < noisy[2000, 10] < noisy[100, 10]
+    assert noisy[2000, 100] < noisy[100, 100] < noisy[100, 10]
+
+
+def test_levels_of_noise_share_their_draws() -> None:
+    errors = errors_of({"boxes": boxes(2000, 100)}, [0.005, 0.01], n_realizations=1)
+    # The first order in the noise doubles; the rest is noise^2 and the trapezoidal rule.
+    small, large = errors["error"]
+    assert large / small == pytest.approx(2.0, rel=0.05)

@@ -11,25 +11,30 @@ from ep2sindy.studies.benchmark import Variant, published_cells
 from tests import programs
 from tests.programs import summary_of
 
-
-def composed(*overrides: str) -> DictConfig:
-    return programs.composed("+exp=benchmark", *overrides)
-
-
-def toy(output: Path) -> list[str]:
-    return [
-        f"output={output}",
-        "n_realizations=1",
-        "parallel=serial",
-        "systems=[lotka_volterra,oscillator]",
-        "noises=[0,0.05]",
+TOYS = {
+    "benchmark": [
+        "n_realizations=1", "systems=[lotka_volterra,oscillator]", "noises=[0,0.05]",
         "variants=[ALASSO,ours]",
-    ]
+    ],
+    "frontier": ["variants=[STLSQ,ours]", "rates_Hz=[1,20]", "durations_s=[5,40]"],
+    "weak_windows": [
+        "grids.boxes.test_functions={n_windows: [100,300], n_points: [10,30]}", "noises=[0.0,0.1]",
+        "n_realizations=2",
+    ],
+}  # fmt: skip
+
+
+def composed(name: str = "benchmark", *overrides: str) -> DictConfig:
+    return programs.composed(f"+exp={name}", *overrides)
+
+
+def toy(name: str, output: Path) -> list[str]:
+    return [*TOYS[name], f"output={output}", "parallel=serial"]
 
 
 @pytest.fixture(scope="module")
 def toy_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return run_config(composed(*toy(tmp_path_factory.mktemp("outputs"))))
+    return run_config(composed("benchmark", *toy("benchmark", tmp_path_factory.mktemp("outputs"))))
 
 
 def test_every_cell_is_counted(toy_run: Path) -> None:
@@ -74,6 +79,48 @@ def test_every_definition_makes_a_variant() -> None:
         if not name.startswith("PySINDy"):
             assert isinstance(instantiate(definition), AnyMethod)
     pytest.importorskip("pysindy")
-    for name, definition in composed("definitions=pysindy").definitions.items():
+    for name, definition in composed("benchmark", "definitions=pysindy").definitions.items():
         if name.startswith("PySINDy"):
             assert isinstance(instantiate(definition), Variant)
+
+
+def test_a_frontier_says_where_variants_cannot_run(tmp_path: Path) -> None:
+    frontier = programs.computed(composed("frontier", *toy("frontier", tmp_path)))
+    points = frontier.summary["points"]
+    found = {(p["variant"], p["rate_Hz"], p["duration_s"]): p["identified"] for p in points}
+    assert [key[1:] for key in found][:4] == [(1, 5), (1, 40), (20, 5), (20, 40)]
+    assert len(found) == 8
+    assert (found["STLSQ", 20, 40], found["ours", 20, 40], found["STLSQ", 1, 5]) == (1, 1, 0)
+    headline = frontier.report.headline
+    for name in ("STLSQ", "ours"):
+        identified = [value for key, value in found.items() if key[0] == name]
+        assert headline[f"{name}/identified_percent"] == 25.0 * sum(identified)
+    assert "STLSQ 1" in frontier.page  # too few samples to smooth
+    frontier.check_figures("frontier")
+
+
+def test_every_kind_of_window_has_an_error(tmp_path: Path) -> None:
+    found = programs.computed(composed("weak_windows", *toy("weak_windows", tmp_path)))
+    cells = found.summary["cells"]
+    assert len(cells) == 2 * (4 + 3)
+    others = {cell["fit"] for cell in cells if cell["n_points"] is None}
+    assert others == {"differential", "automatic", "automatic_weighted"}
+    assert all(cell["n"] == 2 for cell in cells)
+    assert found.report.headline["n_windows_100_n_points_10/error_10_percent"] > 0.0
+    found.check_figures("errors")
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("variants=[STLSQ,weak]", r"must all choose terms, or none of them, got \['STLSQ', 'w"),
+        ("variants=[other]", r"unknown variants \['other'\]; there are"),
+        ("+grids={other: {a: [1]}}", r"unknown variants \['other'\]; there are"),
+        ("+grids={STLSQ: {depth: [1]}, ours: {depth: [1]}}", "of its own, got 'depth_1' twice"),
+        ("variants=[knee]", "has `find`, or a form of the regression, got Knee"),
+    ],
+)
+def test_variants_are_methods_or_forms(override: str, message: str) -> None:
+    more = [f"+definitions.{n}={{_target_: ep2sindy.{n.title()}}}" for n in ("weak", "knee")]
+    with pytest.raises(ValueError, match=message):
+        programs.computed(composed("benchmark", *more, override))

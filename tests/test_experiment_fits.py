@@ -41,12 +41,6 @@ def weak(path: Path, output: Path) -> list[str]:
     return [*on_file("weak", path, output), *windows]
 
 
-def weak_windows(output: Path) -> list[str]:
-    windows = ["fits.boxes.n_windows=[100,300]", "fits.boxes.n_points=[10,30]"]
-    few = ["noises=[0.0,0.1]", "n_realizations=2", "parallel=serial"]
-    return ["+exp=weak_windows", *windows, *few, f"output={output}"]
-
-
 def theories(output: Path) -> list[str]:
     """Two structures at two points of the law, without a recorded balance."""
     points = ",".join(

@@ -1,6 +1,7 @@
 """The page of every experiment, in a browser: the result first, whole in itself, at two widths."""
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -41,6 +42,10 @@ def discover(path: Path, output: Path) -> list[str]:
     ]  # fmt: skip
 
 
+def benchmark(name: str, _: Path, output: Path) -> list[str]:
+    return test_experiment_benchmark.toy(name, output)
+
+
 def trace(path: Path, output: Path) -> list[str]:
     record = output / "scope.csv"
     return test_experiment_trace.toy(
@@ -49,14 +54,10 @@ def trace(path: Path, output: Path) -> list[str]:
 
 
 TOYS: dict[str, Toy] = {
-    "benchmark": lambda _, output: test_experiment_benchmark.toy(output),
+    **{name: partial(benchmark, name) for name in test_experiment_benchmark.TOYS},
     "breathing": test_experiment_libraries.breathing,
     "constrained": test_experiment_fits.constrained,
     "discover": discover,
-    "frontier": lambda _, output: [
-        "parallel=serial", "variants=[STLSQ,ours]", "rates_Hz=[1,20]", "durations_s=[5,40]",
-        f"output={output}",
-    ],
     "ils": test_experiment_fits.ils,
     "parametric": lambda _, output: [
         *test_experiment_parametric.toy(output), test_experiment_parametric.POINTS,
@@ -72,7 +73,6 @@ TOYS: dict[str, Toy] = {
     "theories": lambda _, output: test_experiment_fits.theories(output),
     "trace": trace,
     "weak": test_experiment_fits.weak,
-    "weak_windows": lambda _, output: test_experiment_fits.weak_windows(output),
     "zones": lambda _, output: test_several_zones.toy(output),
 }  # fmt: skip
 

@@ -15,6 +15,7 @@ from ep2sindy.runtime.parallel import Loky, Serial
 from ep2sindy.runtime.user_cache import cache_folder
 from ep2sindy.studies import benchmark, trace
 from tests.programs import Computed, composed, computed
+from tests.test_experiment_benchmark import TOYS
 from tests.test_experiment_trace import glance, scope, signal
 
 
@@ -148,11 +149,9 @@ def check_same(whole: Computed, rest: Computed) -> None:
         assert model.coef.tobytes() == rest.report.models[name].coef.tobytes()
 
 
-def test_a_benchmark_goes_on(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    config = composed(
-        "+exp=benchmark", "systems=[oscillator,lotka_volterra]", "noises=[0.0,0.05]",
-        "n_realizations=2", "variants=[STLSQ,ours]", "parallel=serial",
-    )  # fmt: skip
+@pytest.mark.parametrize("name", TOYS)
+def test_benchmarks_go_on(name: str, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = composed(f"+exp={name}", *TOYS[name], "parallel=serial")
     whole = computed(config)
     check_same(whole, broken_and_resumed(monkeypatch, config, after=3))
     assert not list(cache.rglob("output.pkl"))  # removed once all is written

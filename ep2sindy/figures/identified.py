@@ -60,7 +60,7 @@ def merit_table(cells: pd.DataFrame, published: pd.DataFrame, merit: str) -> pd.
 def frontier_figure(points: pd.DataFrame) -> Figure:
     """A panel per variant: sampling rate against duration, filled marks where it found the system.
 
-    points: from `Study.points` of `studies.frontier`.
+    points: variant, rate_Hz, duration_s, identified, reason.
     """
     variants = list(points["variant"].unique())
     figure, axes = style.make_row(len(variants), width=2.6, height=3.5)

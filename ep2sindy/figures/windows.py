@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -45,16 +44,17 @@ def loss_against_window_figure(rows: pd.DataFrame, *, period: float) -> Figure:
     return figure
 
 
-def window_error_figure(cells: pd.DataFrame, *, references: Sequence[str]) -> Figure:
+def window_error_figure(cells: pd.DataFrame) -> Figure:
     """Coefficient error against noise: a panel per window length, a line per number of windows.
 
-    cells: from `studies.weak_windows.error_cells`. references: forms without a choice of
-    windows, drawn in every panel.
+    cells: from `studies.benchmark.error_cells`. Forms without a choice of windows are in every
+    panel.
     """
     # Errors without noise come from the quadrature and are decades lower; see the table.
     noisy = cells[cells["noise"] > 0.0]
     shown = noisy if len(noisy) else cells
     lengths = cells["n_points"].dropna().unique()
+    references = cells.loc[cells["n_points"].isna(), "fit"].unique()
     figure, axes = style.make_row(len(lengths), width=2.9, height=3.6)
     for ax, n_points in zip(axes, lengths, strict=True):
         for look, name in zip(("--", "-", ":"), references, strict=False):

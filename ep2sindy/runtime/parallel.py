@@ -70,7 +70,7 @@ def refuse_part(part: Part | None) -> None:
         raise ValueError(
             "parts are joined by the pieces that a study keeps for the others, got part="
             f"{[*part]} where none are kept: set parallel.part in +exp=pointwise, parametric, "
-            "predict or benchmark, with keep=true"
+            "predict, benchmark, frontier or weak_windows, with keep=true"
         )
 
 

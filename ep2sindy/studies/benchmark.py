@@ -1,48 +1,57 @@
-"""The thesis's synthetic benchmark: how often each variant of the method finds known equations.
+"""How well methods find known equations: `+exp=benchmark`, `frontier` and `weak_windows`.
 
-The experiment is `+exp=benchmark`. Source: the thesis, appendix, II-E and III-C. The experiment
-`+exp=frontier` uses the same variants and figures of merit.
+Realizations of known systems, over levels of noise, sampling rates and durations, go through named
+methods. Methods that choose terms are counted; of forms of the regression, which are given the
+terms, the error of the coefficients is measured. Source: the thesis, appendix, II-E and III.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence, Set
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Annotated, Any, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 import pandas as pd
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.method import Finding
-from ep2sindy.figures.identified import (
-    COUNTS,
-    MERITS,
-    benchmark_figure,
-)
-from ep2sindy.library.library import Library
+from ep2sindy.figures.identified import COUNTS, MERITS, benchmark_figure, frontier_figure
+from ep2sindy.figures.windows import window_error_figure
+from ep2sindy.library.library import Library, named_terms
+from ep2sindy.library.relations import constraint
+from ep2sindy.regression.constrained import constrained_fit
+from ep2sindy.regression.rows import Formulation
 from ep2sindy.report.document import Result, Text
 from ep2sindy.report.report import Report
 from ep2sindy.runtime.parallel import Workers, rows_in_order
 from ep2sindy.runtime.progress import SILENT, Progress
+from ep2sindy.studies.fitted import boxes_of
 from ep2sindy.studies.resume import resumed
-from ep2sindy.studies.study import Count, Deferred, Levels, Names
+from ep2sindy.studies.study import A_LIST, Count, Deferred, Levels, Names, Positives
 from ep2sindy.systems.draws import check_systems, realization
 from ep2sindy.systems.systems import System
+from ep2sindy.trust.user_code import nodes_of
 
-FIGURE = (
-    "Realizations in which all true equations are among the candidates (left), and are the ones "
-    "selected (right), in %. A dash: the variant selects nothing, or N/A in the thesis."
-)
+CAPTIONS = {
+    "benchmark": "Realizations in which all true equations are among the candidates (left), and "
+    "are the ones selected (right), in %. A dash: the variant selects nothing, or N/A in the "
+    "thesis.",
+    "frontier": "Filled: the true equations of all states are on the variant's fronts. Hollow: "
+    "they are not. Cross: too few samples for the variant to run, which counts as not identified.",
+    "errors": "||beta - beta_true|| / ||beta_true|| over all equations against noise: a panel per "
+    "window length, a line per number of windows; black: the same forms in every panel.",
+}
 INTRODUCTION = (
-    "Each realization draws an initial state, or for the Van der Pol oscillator its parameter, at "
-    "random; white noise of the given fraction of each state's RMS is added; the library holds all "
-    "products of the states up to a degree. A realization counts only if the equations of all "
-    "states are right at once. Every variant sees the same realizations."
+    "A system that is named draws an initial state, or for the Van der Pol oscillator its "
+    "parameter, at random; one that is given stays as it is. White noise of the given fraction of "
+    "each state's RMS is added; the library holds all products of the states up to a degree. A "
+    "realization counts only if the equations of all states are right at once. Every variant sees "
+    "the same realizations."
 )
 CELLS = (
     "on_front, selected: numbers of realizations, of n, whose true equations are on the front, and "
@@ -50,8 +59,27 @@ CELLS = (
     "cpu_s_per_search: of all equations of one realization, on one thread. thesis: its own "
     "numbers, of 100 realizations."
 )
-SELECTED = {"selected": "selected exactly right", "on_front": "right on the front"}
-Draw = Callable[[str, float, int], tuple[System, list[Trajectory]]]  # `realization`, with settings
+ERRORS = (
+    "The terms of the equations are known, and least squares finds their coefficients. Without "
+    "noise the error is that of the integrals and derivatives."
+)
+SELECTED = {
+    "selected": "selected exactly right",
+    "on_front": "right on the front",
+    "identified": "identified",
+}
+# Columns of `cells`: each from a column of the outcomes, if they have it.
+AGGREGATES: Mapping[str, tuple[str, Any]] = {
+    "on_front": ("on_front", "sum"),
+    "selected": ("selected", lambda s: s.sum(min_count=1)),
+    "mean_correct_terms": ("correct_terms", "mean"),
+    "error_mean": ("error", "mean"),
+    "error_std": ("error", "std"),
+    "n": ("cpu_s", "size"),
+    "cpu_s_per_search": ("cpu_s", "median"),
+}
+Systems = Annotated[Sequence[str | System], A_LIST]
+Draw = Callable[..., tuple[System, list[Trajectory]]]  # `realization`, with settings
 
 
 @runtime_checkable
@@ -63,22 +91,40 @@ class Variant(Protocol):
     ) -> Finding: ...
 
 
-def build_variants(names: Sequence[str], definitions: Mapping[str, Deferred]) -> dict[str, Variant]:
+Ways: TypeAlias = Mapping[str, Variant | Formulation]
+
+
+def build_variants(
+    names: Sequence[str],
+    definitions: Mapping[str, Deferred],
+    grids: Mapping[str, Mapping[str, Any]],
+) -> Ways:
     """Build the named methods from `definitions`; the others are not built.
 
-    Raises ValueError for an unknown name, or for an object without a `find` method.
+    grids: lists of values in place of some settings of a method, each combination of which is a
+    method of its own, `n_windows_100_n_points_10`.
+    Raises ValueError for an unknown name or two equal ones, for what is neither a method with
+    `find` nor a form of the regression, or for both kinds together.
     """
-    unknown = [name for name in names if name not in definitions]
-    if unknown:
+    if unknown := [name for name in (*names, *grids) if name not in definitions]:
         raise ValueError(f"unknown variants {unknown}; there are {list(definitions)}")
-    variants = {}
+    variants: dict[str, Variant | Formulation] = {}
     for name in names:
-        variant = definitions[name].build()
-        if not isinstance(variant, Variant):
-            raise ValueError(
-                f"definitions.{name} must name a _target_ that has `find`, got {variant}"
-            )
-        variants[name] = variant
+        nodes = {at: node for at, node in nodes_of(grids.get(name)) if "[" not in at}
+        lists = {at: node for at, node in nodes.items() if isinstance(node, list) and node}
+        for values in product(*lists.values()):
+            places = dict(zip(lists, values, strict=True))
+            label = "_".join(f"{at.rpartition('.')[2]}_{value}" for at, value in places.items())
+            if (label or name) in variants:
+                raise ValueError(f"each variant needs a name of its own, got {label!r} twice")
+            variants[label or name] = variant = definitions[name].changed(places).build()
+            if not isinstance(variant, Variant | Formulation):
+                raise ValueError(
+                    f"definitions.{name} must name a _target_ that has `find`, or a form of the "
+                    f"regression, got {variant}"
+                )
+    if len({isinstance(each, Variant) for each in variants.values()}) > 1:
+        raise ValueError(f"variants must all choose terms, or none of them, got {[*variants]}")
     return variants
 
 
@@ -95,104 +141,137 @@ def merits(finding: Finding, system: System) -> dict[str, float]:
     }
 
 
+def coefficient_error(
+    form: Formulation, system: System, runs: Sequence[Trajectory], *, rng: np.random.Generator
+) -> float:
+    """||beta - beta_true|| / ||beta_true||; beta holds the coefficients of all equations."""
+    truth = {state: system.model.terms(state) for state in system.model.states}
+    names = list(dict.fromkeys(name for terms in truth.values() for name in terms))
+    library = named_terms(system.model.library.variables, names)
+    held = constraint(library, {state: list(terms) for state, terms in truth.items()})
+    found = constrained_fit(form.assemble(runs, library, rng=rng), held)
+    beta = np.array([found.terms(state).get(term, 0.0) for state, term in held.coefficients])
+    beta_true = np.array([truth[state][term] for state, term in held.coefficients])
+    return float(np.linalg.norm(beta - beta_true) / np.linalg.norm(beta_true))
+
+
 @dataclass(frozen=True)
 class Study:
-    """Run every variant on the same realizations of all systems and noises; count successes.
+    """Run every variant on the same realizations of known systems, and see how right it is.
 
-    systems: names in `systems.draws.DRAWS`. noises: standard deviations of the white noise, in RMS
-    of each state. n_trajectories: number of trajectories in each realization. degree: of the
-    library; None takes each system's own. variants: names among the definitions. keep: whether a
-    run continues with the finished realizations of one that was interrupted.
+    systems: names in `systems.draws.DRAWS`, or systems. noises: standard deviations of the white
+    noise, in RMS of each state. rates_Hz, durations_s: sampling; None takes each system's own.
+    n_realizations: None for one, of a system that draws nothing. n_trajectories: number of
+    trajectories in each realization. degree: of the library; None takes each system's own.
+    variants: names among the definitions. grids: see `build_variants`. keep: whether a run
+    continues with the finished realizations of one that was interrupted.
     """
 
-    systems: Names
+    systems: Systems
     noises: Levels
-    n_realizations: Count
-    n_trajectories: Count
-    degree: Count | None
+    n_realizations: Count | None
     variants: Names
     definitions: Mapping[str, Deferred]
     parallel: Workers
+    n_trajectories: Count = 1
+    degree: Count | None = None
+    rates_Hz: Positives | None = None
+    durations_s: Positives | None = None
+    grids: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     keep: bool = True
 
     def run(self, report: Report) -> None:
-        published = published_cells()
-        variants = build_variants(self.variants, self.definitions)
+        variants = build_variants(self.variants, self.definitions, self.grids)
         with resumed(self.keep, report, self.parallel) as workers:
             outcomes = replace(self, parallel=workers).outcomes(
                 variants, seed=report.seed, progress=report.watch
             )
-            counted = cells(outcomes)
             report.section(
                 "Realizations",
-                f"Realizations of every system and noise level: {self.n_realizations}.",
+                "Realizations of every system, noise level, sampling rate and duration: "
+                f"{self.n_realizations or 1}.",
                 Text(INTRODUCTION, page_only=True),
             )
-            draw = partial(benchmark_figure, counted, thesis=published)
-            report.figure("benchmark", draw, FIGURE)
-        add_tables(report, outcomes, counted, published)
+            if "error" in outcomes:
+                add_errors(report, outcomes, variants)
+            elif {"rate_Hz", "duration_s"} <= {*outcomes}:
+                add_frontier(report, outcomes)
+            else:
+                add_counts(report, outcomes)
         report.section("Variants")
         report.add(*(Text(f"{name}: {each}", page_only=True) for name, each in variants.items()))
-        report.headline |= means(counted)
-        report.found(best_variant(counted))
 
     def outcomes(
-        self, variants: Mapping[str, Variant], *, seed: int = 0, progress: Progress = SILENT
+        self, variants: Ways, *, seed: int = 0, progress: Progress = SILENT
     ) -> pd.DataFrame:
-        """Figures of merit of every variant on every realization; workers share the realizations.
+        """How right every variant is on every realization; workers share the realizations.
 
-        One row per system, noise, number and variant. on_front and selected: 1 if the equations of
-        all states are right, else 0. correct_terms: number of true terms among the selected ones.
-        cpu_s: time of the search. selected and correct_terms are NaN for a variant that selects
-        nothing. Raises ValueError for an unknown system, or if there is nothing to run.
+        One row per system, noise, rate, duration, number and variant, with the axes that are set.
+        on_front and selected: 1 if the equations of all states are right, else 0. correct_terms:
+        number of true terms among the selected ones. error: see `coefficient_error`. cpu_s: time of
+        the search. selected and correct_terms are NaN for a variant that selects nothing. reason:
+        why a variant could not run on so few samples, or an empty string. Raises ValueError for an
+        unknown system, if there is nothing to run, or if a variant cannot run on the longest and
+        fastest trajectory of all: the cause is then not the number of samples.
         """
-        check_systems(self.systems)
-        tasks = list(product(self.systems, sorted(self.noises), range(self.n_realizations)))
-        assess = partial(assessed, variants, self._draw(seed), seed=seed)
+        check_systems([name for name in self.systems if isinstance(name, str)])
+        # The largest comes first: a variant that cannot run at all fails before the work is done.
+        sampling = {"rate_Hz": self.rates_Hz, "duration_s": self.durations_s}
+        sampled = {name: sorted(each, reverse=True) for name, each in sampling.items() if each}
+        axes = {"system": self.systems, "noise": sorted(self.noises), **sampled}
+        axes |= {"number": range(self.n_realizations)} if self.n_realizations else {}
+        tasks = [dict(zip(axes, place, strict=True)) for place in product(*axes.values())]
+        count, largest = self.n_trajectories, {(name, each[0]) for name, each in sampled.items()}
+        draw = partial(realization, n_trajectories=count, degree=self.degree, seed=seed)
+        assess = partial(assessed, variants, draw, seed=seed, largest=largest)
         rows = rows_in_order(self.parallel, assess, tasks, "realization", progress)
         return pd.DataFrame(rows)
 
-    def _draw(self, seed: int) -> Draw:
-        count = self.n_trajectories
-        return partial(realization, n_trajectories=count, degree=self.degree, seed=seed)
-
 
 def assessed(
-    variants: Mapping[str, Variant], draw: Draw, task: tuple[str, float, int], *, seed: int
+    variants: Ways,
+    draw: Draw,
+    task: Mapping[str, Any],
+    *,
+    seed: int,
+    largest: Set[tuple[str, float]] = frozenset(),
 ) -> list[dict[str, object]]:
-    """Rows of `Study.outcomes` of one realization: a system, a noise, and its number."""
-    name, noise, number = task
-    system, runs = draw(name, noise, number)
-    rows: list[dict[str, object]] = []
+    """Rows of `Study.outcomes` of one realization. largest: rate and duration of the largest."""
+    name, rows = task["system"], list[dict[str, object]]()
+    place = {**task, "system": name.name if isinstance(name, System) else name}
     for label, variant in variants.items():
         # Each variant has its own random stream, so that leaving one out changes no other.
-        rng = np.random.default_rng([seed, number, *label.encode()])
-        start = time.process_time()
-        finding = variant.find(runs, system.model.library, rng=rng)
-        cpu_s = time.process_time() - start
-        rows.append(
-            {"system": name, "noise": noise, "number": number, "variant": label}
-            | merits(finding, system)
-            | {"cpu_s": cpu_s}
-        )
+        numbers = [task["number"]] if "number" in task else []
+        rng = np.random.default_rng([seed, *numbers, *label.encode()])
+        found: dict[str, float] = {}
+        reason = ""
+        try:
+            system, runs = draw(**task)
+            start = time.process_time()
+            if isinstance(variant, Variant):
+                found = merits(variant.find(runs, system.model.library, rng=rng), system)
+            else:
+                found = {"error": coefficient_error(variant, system, runs, rng=rng)}
+            found["cpu_s"] = time.process_time() - start
+        except ValueError as error:
+            if largest <= task.items():
+                raise
+            reason = str(error)
+        rows.append({**place, "variant": label, **found, "reason": reason})
     return rows
 
 
-def cells(outcomes: pd.DataFrame) -> pd.DataFrame:
-    """Counts over all realizations, one row per system, noise and variant.
+def cells(
+    outcomes: pd.DataFrame, by: Sequence[str] = ("system", "noise", "variant")
+) -> pd.DataFrame:
+    """Counts and means over all realizations, one row for each value of the columns `by`.
 
-    on_front, selected: numbers of realizations. mean_correct_terms: mean over the realizations.
-    n: number of realizations. cpu_s_per_search: the median, so that compilation during the first
-    search does not count.
+    on_front, selected: numbers of realizations. mean_correct_terms, error_mean, error_std: over the
+    realizations. n: number of realizations. cpu_s_per_search: the median, so that compilation
+    during the first search does not count.
     """
-    grouped = outcomes.groupby(["system", "noise", "variant"], sort=False)
-    return grouped.agg(
-        on_front=("on_front", "sum"),
-        selected=("selected", lambda s: s.sum(min_count=1)),
-        mean_correct_terms=("correct_terms", "mean"),
-        n=("number", "count"),
-        cpu_s_per_search=("cpu_s", "median"),
-    ).reset_index()
+    there = {name: how for name, how in AGGREGATES.items() if how[0] in outcomes}
+    return outcomes.groupby([*by], sort=False).agg(**there).reset_index()
 
 
 def published_cells() -> pd.DataFrame:
@@ -208,40 +287,83 @@ def published_cells() -> pd.DataFrame:
     return table.assign(n=100)
 
 
-def add_tables(
-    report: Report, outcomes: pd.DataFrame, cells: pd.DataFrame, published: pd.DataFrame
-) -> None:
-    """Add all outcomes, and our cells next to the thesis's."""
+def add_counts(report: Report, outcomes: pd.DataFrame) -> None:
+    """Add how often every variant is right, by system and noise, next to the thesis's numbers."""
+    counted, published = cells(outcomes), published_cells()
+    draw = partial(benchmark_figure, counted, thesis=published)
+    report.figure("benchmark", draw, CAPTIONS["benchmark"])
     keys, columns = ["system", "noise", "variant"], {merit: f"thesis_{merit}" for merit in MERITS}
     beside = published.rename(columns=columns)[[*keys, *columns.values()]]
-    beside = cells.astype(dict.fromkeys(COUNTS, "Int64")).merge(beside, how="left", on=keys)
+    beside = counted.astype(dict.fromkeys(COUNTS, "Int64")).merge(beside, how="left", on=keys)
     report.samples("outcomes", outcomes)
     report.section("By system and noise")
     report.table("cells", beside, note=CELLS, page_only=True)
+    for name, rows in counted.groupby("variant", sort=False):
+        report.headline[f"{name}/mean_correct_terms"] = float(rows["mean_correct_terms"].mean())
+        report.headline[f"{name}/cpu_ms"] = float(1e3 * rows["cpu_s_per_search"].mean())
+    conclude(report, counted, picture="benchmark", table="cells")
 
 
-def means(cells: pd.DataFrame) -> dict[str, float]:
-    """Means over systems and noises; a variant that selects nothing has 0 %, and NaN terms."""
-    found = {}
-    for name, rows in cells.groupby("variant", sort=False):
-        for merit in COUNTS:
-            found[f"{name}/{merit}_percent"] = 100.0 * rows[merit].sum() / rows["n"].sum()
-        found[f"{name}/mean_correct_terms"] = rows["mean_correct_terms"].mean()
-        found[f"{name}/cpu_ms"] = 1e3 * rows["cpu_s_per_search"].mean()
-    return {name: float(value) for name, value in found.items()}
+def add_frontier(report: Report, outcomes: pd.DataFrame) -> None:
+    """Add at which sampling rates and durations every variant has the equations on its fronts."""
+    found = cells(outcomes, ["variant", "rate_Hz", "duration_s", "reason"])
+    # By variant, from the smallest on.
+    points = pd.concat([each[::-1] for _, each in found.groupby("variant", sort=False)])
+    points["n_samples"] = (points["rate_Hz"] * points["duration_s"]).round().astype(int)
+    points["identified"] = points["on_front"] == points["n"]
+    points = points[["variant", "rate_Hz", "duration_s", "n_samples", "identified", "reason"]]
+    few = points[points["reason"] != ""].groupby("variant", sort=False).size()
+    counts = ", ".join(f"{variant} {n}" for variant, n in few.items())
+    report.add(f"Too few samples to run: {counts or 'none'}; tables/points.csv says why.")
+    report.figure("frontier", partial(frontier_figure, points), CAPTIONS["frontier"])
+    report.table("points", points, shown=False)
+    conclude(report, points.assign(n=1), picture="frontier", table="points")
 
 
-def best_variant(cells: pd.DataFrame) -> Result:
-    """The variant that selects, or has on its front, the right equations most often."""
-    merit = "selected" if cells["selected"].notna().any() else "on_front"
-    counts = cells.dropna(subset=[merit]).groupby("variant", sort=False)[[merit, "n"]].sum()
-    percent = 100 * counts[merit] / counts["n"]
+def conclude(report: Report, counted: pd.DataFrame, *, picture: str, table: str) -> None:
+    """Say which variant is right most often; a variant that selects nothing has 0 % selected."""
+    there = [merit for merit in SELECTED if merit in counted]
+    for name, rows in counted.groupby("variant", sort=False):
+        for merit in there:
+            share = 100.0 * rows[merit].sum() / rows["n"].sum()
+            report.headline[f"{name}/{merit}_percent"] = float(share)
+    merit = next(each for each in there if counted[each].notna().any())
+    known = counted.dropna(subset=[merit]).groupby("variant", sort=False)[[merit, "n"]].sum()
+    percent = 100 * known[merit] / known["n"]
     best = str(percent.idxmax())
+    title = f"{best}, {SELECTED[merit]} in {percent[best]:.0f} % of {int(known['n'][best])}"
     fractions = "; ".join(f"{name} {value:.0f} %" for name, value in percent.items())
-    return Result(
-        f"Found: {best}, {SELECTED[merit]} in {percent[best]:.0f} % of {int(counts['n'][best])} "
-        "realizations",
-        [Text(f"{SELECTED[merit]}: {fractions}")],
-        load='pandas.read_csv("{}/tables/cells.csv")',
-        picture="benchmark",
+    _found(report, f"{title} realizations", f"{SELECTED[merit]}: {fractions}", picture, table)
+
+
+def add_errors(report: Report, outcomes: pd.DataFrame, forms: Ways) -> None:
+    """Add the mean error of the coefficients in every form, by noise."""
+    means = error_cells(outcomes, forms)
+    report.figure("errors", partial(window_error_figure, means), CAPTIONS["errors"])
+    report.section("Coefficient error, mean over the realizations")
+    report.table("cells", means, note=ERRORS)
+    report.samples("errors", outcomes.rename(columns={"variant": "fit"}))
+    for row in means.to_dict("records"):
+        report.headline[f"{row['fit']}/error_{100 * row['noise']:g}_percent"] = row["error_mean"]
+    least = means.loc[means.groupby("noise")["error_mean"].idxmin()].to_dict("records")
+    lines = "; ".join(
+        f"{100 * row['noise']:g} % noise: {row['fit']}, {100 * row['error_mean']:.2g} %"
+        for row in least
     )
+    title = f"the windows of least error for {', '.join(outcomes['system'].unique())}"
+    _found(report, title, f"error of the coefficients in the mean: {lines}", "errors", "cells")
+
+
+def error_cells(outcomes: pd.DataFrame, forms: Ways) -> pd.DataFrame:
+    """`cells` of forms by noise. n_windows, n_points: missing for forms without random windows."""
+    means = cells(outcomes, ["variant", "noise"]).rename(columns={"variant": "fit"})
+    boxes = [boxes_of(forms[name]) for name in means["fit"]]
+    for place, key in enumerate(("n_windows", "n_points"), start=1):
+        values = [getattr(box, key) if box else None for box in boxes]
+        means.insert(place, key, pd.Series(values, dtype="Int64"))
+    return means
+
+
+def _found(report: Report, title: str, details: str, picture: str, table: str) -> None:
+    load = f'pandas.read_csv("{{}}/tables/{table}.csv")'
+    report.found(Result(f"Found: {title}", [Text(details)], load=load, picture=picture))

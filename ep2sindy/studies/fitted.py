@@ -95,7 +95,7 @@ def expand(
     return found
 
 
-def boxes_of(form: Formulation) -> Boxes | None:
+def boxes_of(form: object) -> Boxes | None:
     """The random windows of a form; None if it has none."""
     functions = form.test_functions if isinstance(form, Weak) else None
     return functions if isinstance(functions, Boxes) else None

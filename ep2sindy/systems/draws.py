@@ -36,45 +36,56 @@ DRAWS: Mapping[str, Callable[[np.random.Generator], System]] = {
 
 
 def realization(
-    name: str,
-    noise: float,
-    number: int,
+    system: str | System,
+    noise: float = 0.0,
+    number: int = 0,
     *,
+    rate_Hz: float | None = None,
+    duration_s: float | None = None,
     n_trajectories: int = 1,
     degree: int | None = None,
     seed: int = 0,
 ) -> tuple[System, list[Trajectory]]:
     """One draw of a system with noisy trajectories; the draw is the same for every noise level.
 
-    noise: standard deviation of the white noise, in RMS of each state. n_trajectories: the first
-    trajectory starts at the draw's own start; the others start at those of further draws, or in
-    [-2, 2]^2 for the Van der Pol oscillator. degree: of the library; None takes the system's own.
+    system: a name in `DRAWS`, or a system, of which the noise alone is drawn. noise: standard
+    deviation of the white noise, in RMS of each state. rate_Hz, duration_s: sampling; None takes
+    the system's own. n_trajectories: the first trajectory starts at the draw's own start; the
+    others start at those of further draws, or in [-2, 2]^2 for the Van der Pol oscillator. degree:
+    of the library; None takes the system's own.
     """
-    check_systems([name])
-    rng = np.random.default_rng([seed, list(DRAWS).index(name), number])
-    system, starts = DRAWS[name](rng), []
-    for _ in range(n_trajectories - 1):
-        other = rng.uniform(-2.0, 2.0, 2) if name == "van_der_pol" else DRAWS[name](rng).initial
-        starts.append(other)
-    return noisy_records(system, starts, noise, rng, degree=degree)
+    if isinstance(system, System):
+        rng, starts = np.random.default_rng([seed, number]), [system.initial] * n_trajectories
+        streams = [rng, *rng.spawn(n_trajectories - 1)]
+    else:
+        check_systems([system])
+        rng, name = np.random.default_rng([seed, list(DRAWS).index(system), number]), system
+        system = DRAWS[name](rng)
+        starts = [system.initial]
+        for _ in range(n_trajectories - 1):
+            other = rng.uniform(-2.0, 2.0, 2) if name == "van_der_pol" else DRAWS[name](rng).initial
+            starts.append(other)
+        streams = rng.spawn(n_trajectories)
+    rate_Hz, duration_s = rate_Hz or system.rate_Hz, duration_s or system.duration_s
+    system = replace(system, rate_Hz=rate_Hz, duration_s=duration_s)
+    return noisy_records(system, starts, streams, noise, degree=degree)
 
 
 def noisy_records(
     system: System,
-    further: Sequence[Float[np.ndarray, " n_states"]],
+    starts: Sequence[Float[np.ndarray, " n_states"]],
+    streams: Sequence[np.random.Generator],
     noise: float,
-    rng: np.random.Generator,
     *,
     degree: int | None,
 ) -> tuple[System, list[Trajectory]]:
-    """A system with its noisy trajectories, from its own start and from further ones.
+    """A system with its noisy trajectories, each from a start and with a stream for its noise.
 
     degree: of the library; None takes the system's own.
     """
-    starts = [system.initial, *further]
     return system if degree is None else with_degree(system, degree), [
         system.trajectory(initial=start, noise=noise, rng=stream)
-        for start, stream in zip(starts, rng.spawn(len(starts)), strict=True)
+        for start, stream in zip(starts, streams, strict=True)
     ]
 
 

@@ -65,7 +65,8 @@ class System:
         Raises
         ------
         ValueError
-            If the noise is negative, or not zero without an rng.
+            If the noise is negative, or not zero without an rng, or if fewer than two samples fit
+            into the duration.
         """
         if noise < 0.0 or (noise > 0.0 and rng is None):
             raise ValueError(
@@ -102,6 +103,8 @@ def _integrated(
 ) -> tuple[Float[np.ndarray, " samples"], Float[np.ndarray, "samples n_states"]]:
     system = start.system
     t = np.arange(round(system.duration_s * system.rate_Hz)) / system.rate_Hz
+    if len(t) < 2:
+        raise ValueError(f"a trajectory needs two samples: {len(t)} fit in")
     found = solve_stages(
         lambda _, x: system.model.derivative(x, np.empty(0)),
         t,
