@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ep2sindy.model.flow_kernels import advance, sums_of_products
-from ep2sindy.model.runge_kutta import CLASSICAL, step
+from ep2sindy.model.runge_kutta import CLASSICAL
 from ep2sindy.model.vector_field import VectorField
 
 # Equation and term of each coefficient by which a flow is differentiated.
@@ -98,24 +98,27 @@ def _in_arrays(
 
     The tangents T of a state follow T' = (df/dx) T, and those by a coefficient gain its term.
     """
-    d, (equation, term) = states.shape[1], by
+    (n, d), (equation, term), wanted = states.shape, by, slopes.shape[2] > 0
     weights, own = field.weights.reshape(d * (1 + d), -1).T, field.places[term]
-    tangents = slopes[:, :, : d + len(term)]
-    tangents[:] = np.eye(d, tangents.shape[2])  # of no columns, if none are wanted
-
-    def rates(x: np.ndarray, inputs: np.ndarray) -> np.ndarray:
-        """Of a state and its tangents, side by side in the columns of x."""
-        products = field.products.evaluate(np.concatenate([x[:, :, 0], inputs], axis=1))
-        both = (products @ weights).reshape(len(x), d, 1 + d)
-        change = both[:, :, 1:] @ x[:, :, 1:]
-        change[:, equation, d + np.arange(len(term))] += products[:, own]
-        return np.concatenate([both[:, :, :1], change], axis=2)
-
-    x = np.concatenate([states[:, :, None], tangents], axis=2)
+    columns = d + np.arange(len(term))
+    total = slopes[:, :, : d + len(term)]
+    if wanted:
+        total[:, np.arange(d), np.arange(d)] = 1.0
+    leads = CLASSICAL.leads.sum(axis=1)  # each stage leads on from the one before alone
     for k in range(0, len(steps.inputs) - 1, CLASSICAL.stride):
-        x = step(rates, x, steps.inputs[k : k + CLASSICAL.stride + 1], steps.h[:, None, None])
-    tangents[:] = x[:, :, 1:]
-    return np.ascontiguousarray(x[:, :, 0])
+        start, slope, begun, change = states, np.zeros_like(states), total.copy(), 0.0
+        for lead, weight, place in zip(leads, CLASSICAL.weights, CLASSICAL.places, strict=True):
+            ahead, fraction = (lead * steps.h)[:, None], (weight * steps.h)[:, None]
+            values = np.concatenate([start + ahead * slope, steps.inputs[k + place]], axis=1)
+            products = field.products.evaluate(values)
+            both = (products @ weights).reshape(n, d, 1 + d)
+            slope = both[:, :, 0]
+            states = states + fraction * slope
+            if wanted:
+                change = both[:, :, 1:] @ (begun + ahead[:, None] * change)
+                change[:, equation, columns] += products[:, own]
+                total += fraction[:, None] * change
+    return states
 
 
 def _route(field: VectorField) -> Callable[..., Float[np.ndarray, "steps d"]]:

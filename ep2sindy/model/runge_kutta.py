@@ -57,7 +57,7 @@ def dormand_prince() -> tuple[np.ndarray, ...]:
 def step(
     slope: Callable[[np.ndarray, Any], np.ndarray],
     x: np.ndarray,
-    inputs: Sequence[Any] | np.ndarray,
+    inputs: Sequence[Any],
     h: float | np.ndarray,
 ) -> np.ndarray:
     """One classical step of x' = slope(x, inputs), of any number of states at once.
