@@ -108,16 +108,16 @@ def _in_arrays(
     for k in range(0, len(steps.inputs) - 1, CLASSICAL.stride):
         start, slope, begun, change = states, np.zeros_like(states), total.copy(), 0.0
         for lead, weight, place in zip(leads, CLASSICAL.weights, CLASSICAL.places, strict=True):
-            ahead, fraction = (lead * steps.h)[:, None], (weight * steps.h)[:, None]
+            ahead, own_step = (lead * steps.h)[:, None], (weight * steps.h)[:, None]
             values = np.concatenate([start + ahead * slope, steps.inputs[k + place]], axis=1)
             products = field.products.evaluate(values)
             both = (products @ weights).reshape(n, d, 1 + d)
             slope = both[:, :, 0]
-            states = states + fraction * slope
+            states = states + own_step * slope
             if wanted:
                 change = both[:, :, 1:] @ (begun + ahead[:, None] * change)
                 change[:, equation, columns] += products[:, own]
-                total += fraction[:, None] * change
+                total += own_step[:, None] * change
     return states
 
 
