@@ -70,7 +70,8 @@ def test_the_jobs_of_a_sweep_are_compared_but_for_those_that_failed(
     runs: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     sweep, page = tmp_path / "sweep", tmp_path / "page.html"
-    for job, record in {2: {"folder": str(runs[1])}, 10: {"error": "no"}}.items():
+    records = {2: {"folder": str(runs[1])}, 10: {"error": "no"}, 11: {}}  # the last: a part
+    for job, record in records.items():
         write_json(sweep / "jobs" / f"{job}.json", record)
     with pytest.raises(ValueError, match="to compare takes two runs or more"):
         compare([str(sweep)])
@@ -78,7 +79,8 @@ def test_the_jobs_of_a_sweep_are_compared_but_for_those_that_failed(
     capsys.readouterr()
     compare([str(sweep), "--page", str(page)])
     printed = capsys.readouterr().out
-    assert printed.startswith("left out: job 10 failed: no\n")
+    left_out = "left out: job 10 failed: no\nleft out: job 11 has no result of its own\n"
+    assert printed.startswith(left_out)
     assert "search.max_terms" in printed
     assert page.is_file()
     write_json(sweep / "jobs" / "3.json", {"folder": 1})

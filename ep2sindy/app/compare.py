@@ -98,7 +98,8 @@ def folders_of(path: Path) -> list[Path]:
             record = {"error": "", "folder": "", **read_json(read_bytes(place))}
             folder = Path(record["folder"])
         if record["error"] or not record["folder"]:
-            say(f"left out: job {place.stem} failed: {record['error']}")
+            why = f"failed: {record['error']}" if record["error"] else "has no result of its own"
+            say(f"left out: job {place.stem} {why}")
         else:
             found.append(folder)
     return found if records else [path]

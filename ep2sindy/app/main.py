@@ -184,7 +184,9 @@ def run_job(config: DictConfig, conf: Path) -> list[str]:
         say(f"{config.experiment}: loading study={study}; writes below {folder}/")
         from ep2sindy.app.runner import run_config
 
-        record["folder"] = str(run_config(config))
+        path = run_config(config)
+        if (path / "summary.json").is_file():  # a part of a study has no result of its own
+            record["folder"] = str(path)
     except (ValueError, OSError, HydraException, OmegaConfBaseException) as error:
         record["error"] = str(error)
     except BaseException as error:
