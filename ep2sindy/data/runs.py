@@ -22,15 +22,14 @@ if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
 
-TIMES = ("time", "t", "time_s", "t_s")  # accepted names of a table's time column, in seconds
-
-if TYPE_CHECKING:
     Run: TypeAlias = (
         Trajectory | pd.DataFrame | xr.Dataset | tuple[np.ndarray, np.ndarray] | np.ndarray
     )
     Runs: TypeAlias = Run | Sequence[Run] | Mapping[str, Run]
 else:  # pandas is not imported only to name a type
     Run = Runs = object
+
+TIMES = ("time", "t", "time_s", "t_s")  # accepted names of a table's time column, in seconds
 
 
 def trajectories_of(

@@ -261,11 +261,13 @@ def header_of(
         return numbered
     if not has_units and not is_comment:
         _check_names(above)
-    own = [_unit(cell) for cell in units]
-    header = split_names(names, [*own, *[""] * n_columns][:n_columns])
-    if header.names[0].lower() in TIMES and not any(header.units):
-        header = replace(header, units=_preamble_units(above, n_columns))
-    return replace(header, step_s=step_s)
+    parted = [split_name(name) for name in names]
+    below = [*map(_unit, units), *[""] * n_columns][:n_columns]
+    units = [_plain(unit) for unit in (below if any(below) else (unit for _, unit in parted))]
+    plain_names = _unique([name for name, _ in parted])
+    if plain_names[0].lower() in TIMES and not any(units):
+        units = _preamble_units(above, n_columns)
+    return Header(plain_names, tuple(units), step_s)
 
 
 def _check_names(above: Sequence[Sequence[str]]) -> None:
@@ -315,13 +317,6 @@ def _preamble_units(above: Sequence[Sequence[str]], n_columns: int) -> tuple[str
     return tuple(unit if unit_like(unit) else "" for unit in map(_plain, [time, *values]))[
         :n_columns
     ]
-
-
-def split_names(names: Sequence[str], units: Sequence[str] = ()) -> Header:
-    """Header of columns whose names may hold units, as `Time (s)`; units: given elsewhere."""
-    parted = [split_name(name) for name in names]
-    units = units if any(units) else [unit for _, unit in parted]
-    return Header(_unique([name for name, _ in parted]), tuple(map(_plain, units)))
 
 
 def _step_s(above: Sequence[Sequence[str]]) -> float | None:
