@@ -193,7 +193,14 @@ class Report:
         self.board.equations({name: model.text() for name, model in self.models.items()})
         hparams = {"seed": self.seed} | by_places(self.settings, keys)
         self.board.settings(hparams, self.headline)
-        about = self._about(purpose, keys)
+        about = About(
+            purpose=purpose,
+            asked=settings_used(self.settings, keys),
+            messages=self.messages,
+            warnings=self.warnings,
+            provenance=self.provenance,
+            config=(self.folder.path / "config.yaml").read_text("utf-8"),
+        )
         page = page_html(self.title, self.sections, drawn, about, result=self.result)
         write_text(self.folder.file(PAGE), page)
         named = {"experiment": self.title, "seed": self.seed}
@@ -213,16 +220,6 @@ class Report:
             self.board.image(name, png)
             drawn[name] = draw(figure, png, captioned.caption)
         return drawn
-
-    def _about(self, purpose: str, keys: Collection[str]) -> About:
-        return About(
-            purpose=purpose,
-            asked=settings_used(self.settings, keys),
-            messages=self.messages,
-            warnings=self.warnings,
-            provenance=self.provenance,
-            config=(self.folder.path / "config.yaml").read_text("utf-8"),
-        )
 
 
 def _once(kind: str, name: str, known: Collection[str]) -> None:
