@@ -204,7 +204,9 @@ def _from_table(table: pd.DataFrame, partial: bool) -> Trajectory:
         if not time_unit(table.index.name):
             table = table.rename_axis(index=TIMES[0])  # dates are times, whatever they are called
         table = table.reset_index(allow_duplicates=True)
-    table = table.set_axis([_word(name) for name in table.columns], axis="columns")
+    # A bare number gets an x, or it would look like a constant term.
+    words = [f"x{n}" if isinstance(n, int | np.integer) else str(n) for n in table.columns]
+    table = table.set_axis(words, axis="columns")
     if not table.columns.is_unique:
         raise ValueError(
             f"columns of a table must have names of their own, got {list(table.columns)}; rename "
@@ -253,11 +255,6 @@ def _present(
         words = describe_gaps(t[kept], len(t))
     warnings.warn(words, MissingSamples, stacklevel=5)
     return Trajectory(t[kept], values[kept], states, missing=missing, **kept_as_is)
-
-
-def _word(label: object) -> str:
-    """Name for a column. A bare number gets an x, or it would look like a constant term."""
-    return f"x{label}" if isinstance(label, int | np.integer) else str(label)
 
 
 def _elapsed(column: pd.Series) -> tuple[Float[np.ndarray, " rows"], Clock]:
