@@ -149,16 +149,15 @@ class Report:
         """Say what was found."""
         self.result = result
 
-    def say(self, text: str, *, warning: bool = False) -> None:
+    def say(self, text: str) -> None:
         """Print a message at once, on the screen and in run.log, and repeat it on the page."""
-        if not warning:
-            self.messages.append(text)
-        self.screen.print(*renderables(Text(text, warning=warning)))
+        self.messages.append(text)
+        self.screen.print(*renderables(Text(text)))
 
     def warn(self, text: str) -> None:
         """Print a warning at once, and repeat it on the page and in the summary."""
         self.warnings.append(text)
-        self.say(text, warning=True)
+        self.screen.print(*renderables(Text(text, warning=True)))
 
     def when_written(self, end: Callable[[], None]) -> None:
         """Do something once all that was found is written, such as removing what is kept."""
