@@ -25,7 +25,7 @@ from ep2sindy.library.units import SECONDS, Clock
 from ep2sindy.model.model import SparseModel
 from ep2sindy.report.about import by_place
 from ep2sindy.report.document import Block, Link, Picture, Section, Table, Text, cell_text
-from ep2sindy.report.models import equations
+from ep2sindy.report.models import equations, intervals
 from ep2sindy.report.page import page_html
 from ep2sindy.report.picture import read_png
 from ep2sindy.report.results import in_words, value_text
@@ -242,10 +242,7 @@ def _coefficients(models: Mapping[str, SparseModel], clock: Clock) -> pd.DataFra
     rows = []
     for state in dict.fromkeys(s for model in models.values() for s in model.states):
         own = {n: m.terms(state) if state in m.states else {} for n, m in models.items()}
-        ends: dict[str, Any] = {
-            n: {} if m.covariance is None or state not in m.states else m.intervals(state)
-            for n, m in models.items()
-        }
+        ends = {n: (intervals(m) or {}).get(state, {}) for n, m in models.items()}
         for term in dict.fromkeys(t for terms in own.values() for t in terms):
             row = {"equation": f"{state}'", "term": term.replace("*", " ")}
             for label in models:

@@ -206,8 +206,12 @@ def _field(
     points = read_axes(source, axes, dt_s, arrays, wanted, problems)
     if dt_s is None and "time" in points:
         points["time"].attrs[CLOCK] = axes["time"].unit
-    if set(points) == {*axes, "time"}:
-        placed = _assign_dims(source, arrays, wanted, points, problems)
+    file_dims = {str(p.dims[0]): axis for axis, p in points.items()} if source.dims_named else {}
+    lengths = {axis: points[axis].size for axis in DIMS if axis in points}
+    placed = {}
+    for ours, array in arrays.items() if set(points) == {*axes, "time"} else ():
+        with problems.noted():
+            placed[ours] = assign_dims(array, ours, wanted[ours].dims, lengths, file_dims)
     problems.check(source)
     field = xr.Dataset(coords={axis: (axis, p.values, p.attrs) for axis, p in points.items()})
     for ours, array in placed.items():
@@ -217,28 +221,11 @@ def _field(
     for ours, variable in in_file({"mask": mask}, problems).items():
         with problems.noted():
             array = read_array(source, ours, str(variable.name))
-            inside = _assign_dims(source, {ours: array}, {ours: variable}, points, problems)
-            field = mask_outside(field, inside[ours] != 0) if inside else field
+            inside = assign_dims(array, ours, variable.dims, lengths, file_dims)
+            field = mask_outside(field, inside != 0)
     problems.check(source)
     check_field(field)
     return field.assign_attrs(source.attributes)
-
-
-def _assign_dims(
-    source: FileSource,
-    arrays: Mapping[str, xr.DataArray],
-    wanted: Mapping[str, Variable],
-    points: Mapping[str, xr.DataArray],
-    problems: Problems,
-) -> dict[str, xr.DataArray]:
-    """Give arrays our dimension names, in our order."""
-    file_dims = {str(p.dims[0]): axis for axis, p in points.items()} if source.dims_named else {}
-    lengths = {axis: points[axis].size for axis in DIMS if axis in points}
-    placed = {}
-    for ours, array in arrays.items():
-        with problems.noted():
-            placed[ours] = assign_dims(array, ours, wanted[ours].dims, lengths, file_dims)
-    return placed
 
 
 def write_field(field: xr.Dataset, path: str | Path) -> None:

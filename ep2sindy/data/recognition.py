@@ -190,7 +190,7 @@ class _Arrays:
         one = self.at(time)
         if one is None:
             return None
-        usual_s = (one.step or 0.0) * conversion("time", time.unit or "s")[0]
+        usual_s = _step_in_s(one, time.unit)
         is_rounded = one.digits is not None and isclose(usual_s, given_s, rel_tol=0.2)
         return given_s if one.is_counter or is_rounded else None
 
@@ -215,15 +215,12 @@ class _Arrays:
         """
         if (one := self.at(time)) is None:
             return time
-        steps_s = {unit: (one.step or 0.0) * conversion("time", unit)[0] for unit in UNITS_OF_TIME}
-        if not time.unit and self.given_s is not None:
-            fit = [
-                u for u, step_s in steps_s.items() if isclose(step_s, self.given_s, rel_tol=1e-3)
-            ]
+        if not time.unit and (step_s := self.given_s) is not None:
+            fit = [u for u in UNITS_OF_TIME if isclose(_step_in_s(one, u), step_s, rel_tol=1e-3)]
             time = replace(time, unit=fit[0] if fit else "")
         times, given_s = f"the times of {one.name!r}", self.source.step_s
         beside = f", and the file says steps of {given_s:.6g} s next to them" if given_s else ""
-        usual_s = (one.step or 0.0) * conversion("time", time.unit or "s")[0]
+        usual_s = _step_in_s(one, time.unit)
         if one.digits is not None:
             self.questions.append(
                 f"{times} were rounded to {one.digits} digits, so that some repeat: equal steps "
@@ -365,6 +362,11 @@ class _Arrays:
                 for e in rest
                 if words_of(last_of(e.name)) in ELECTRONS
             )
+
+
+def _step_in_s(times: ArrayInfo, unit: str) -> float:
+    """Median step of times in a unit, seconds by default; zero if they do not increase."""
+    return (times.step or 0.0) * conversion("time", unit or "s")[0]
 
 
 def _has_columns(one: ArrayInfo, lengths: Mapping[str, int]) -> bool:

@@ -7,7 +7,7 @@ import warnings
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from glob import escape, glob
 from pathlib import Path
 
@@ -80,7 +80,8 @@ class FilePattern:
         Raises ValueError if no file fits.
         """
         parts = _PLACEHOLDER.split(self.text)
-        shape = "".join("*" if k % 2 else _for_glob(part) for k, part in enumerate(parts))
+        # For a glob, `*` and `?` keep their meaning.
+        shape = "".join("*" if k % 2 else part.replace("[", "[[]") for k, part in enumerate(parts))
         number = NUMBER.replace("[p,]", "p") if "," in self.text else NUMBER
         reads = re.compile(_expression(parts, number), re.DOTALL)
         files = {file: reads.fullmatch(file) for file in sorted(glob(shape))}
@@ -101,18 +102,12 @@ class FilePattern:
         return dict(ordered), others
 
 
-def _for_glob(text: str) -> str:
-    """Text of a pattern for a glob: `*` and `?` keep their meaning."""
-    return text.replace("[", "[[]")
-
-
 def _expression(parts: Sequence[str], number: str) -> str:
     """Regular expression of the pattern that texts and names make by turns."""
-    found, seen = "", set[str]()
+    found = ""
     for k, part in enumerate(parts):
         if k % 2:
-            found += f"(?P={part})" if part in seen else f"(?P<{part}>{number})"
-            seen.add(part)
+            found += f"(?P={part})" if part in parts[1:k:2] else f"(?P<{part}>{number})"
         else:
             found += re.escape(part).replace(r"\*", "[^/]*").replace(r"\?", "[^/]")
     return found
@@ -218,65 +213,51 @@ def read_runs(
     """
     for what, names in {"parameters": parameters, "states": states, "inputs": inputs}.items():
         check_list(what, names)
+    units, runs = units or {}, []
+    for file, named in _points_of(files).items():
+        with file_named(Path(file)):
+            found = inspect_file(file, plasma=plasma)
+            aside = {*named, *parameters} - {*found.variables}
+            given = {"time": "s"} if dt_s is None and "time" in found.no_unit else {}
+            given |= {name: unit for name, unit in units.items() if name not in aside}
+            field = open_field(file, units=given, dt_s=dt_s, plasma=plasma)
+            point = {
+                name: _in_si(name, xr.DataArray(named[name]), units)
+                if name in named
+                else _parameter_in(found, field, name, units)
+                for name in (*named, *parameters)
+            }
+            chosen = states
+            if chosen is None:
+                used = {n for n, v in found.variables.items() if {n, v.name} & {*parameters}}
+                varied = (str(n) for n, each in field.data_vars.items() if "time" in each.dims)
+                chosen = [n for n in varied if n not in {*inputs, *used} and not is_counter_name(n)]
+            axes = {axis for n in (*chosen, *inputs) if n in field for axis in field[n].dims}
+            if zone is None and (space := sorted(map(str, axes - {"time"}))):
+                raise ValueError(
+                    f"a field over {' and '.join(space)} needs a zone to be averaged over: give "
+                    "zone=ep.Zone(z=(FROM, TO)) in m, or ep.Zone() for all of it"
+                )
+            run = zone_average(field, zone, states=chosen, inputs=inputs, label=file)
+            values = {name: float(value) for name, value in point.items()}
+            of_point = {name: value.attrs["units"] for name, value in point.items()}
+            runs.append(replace(run, parameters=values, units={**run.units, **of_point}))
+    return runs
+
+
+def _points_of(files: str | Path | Sequence[str | Path]) -> Mapping[str, Mapping[str, float]]:
+    """The files, each with the parameters that its name says."""
     if isinstance(files, str | Path) and "{" in str(files):
         points, others = FilePattern(str(files)).points()
         if others:
             words = f"left out, for their names hold no number there: {', '.join(others)}"
-            warnings.warn(words, stacklevel=2)
-    else:
-        listed = files_of(files)
-        places = Counter(Path(file).resolve() for file in listed)
-        if twice := [str(place) for place, n in places.items() if n > 1]:
-            raise ValueError(f"every file may come once: {twice[0]} comes again; leave one out")
-        points = {file: {} for file in listed}
-    read = partial(
-        _read_run, parameters=parameters, states=states, inputs=inputs, zone=zone,
-        units=units or {}, dt_s=dt_s, plasma=plasma,
-    )  # fmt: skip
-    return [read(file, named) for file, named in points.items()]
-
-
-def _read_run(
-    file: str,
-    named: Mapping[str, float],
-    *,
-    parameters: Sequence[str],
-    states: Sequence[str] | None,
-    inputs: Sequence[str],
-    zone: Zone | None,
-    units: Mapping[str, str],
-    dt_s: float | None,
-    plasma: bool,
-) -> Trajectory:
-    """The run of one file. named: parameters by its name; parameters: those that it must say."""
-    with file_named(Path(file)):
-        found = inspect_file(file, plasma=plasma)
-        aside = {*named, *parameters} - {*found.variables}
-        given = {"time": "s"} if dt_s is None and "time" in found.no_unit else {}
-        given |= {name: unit for name, unit in units.items() if name not in aside}
-        field = open_field(file, units=given, dt_s=dt_s, plasma=plasma)
-        point = {
-            name: _in_si(name, xr.DataArray(named[name]), units)
-            if name in named
-            else _parameter_in(found, field, name, units)
-            for name in (*named, *parameters)
-        }
-        if states is None:
-            used = {n for n, v in found.variables.items() if {n, v.name} & {*parameters}}
-            varied = (str(n) for n, each in field.data_vars.items() if "time" in each.dims)
-            states = [n for n in varied if n not in {*inputs, *used} and not is_counter_name(n)]
-        axes = {axis for n in (*states, *inputs) if n in field for axis in field[n].dims}
-        if zone is None and (space := sorted(map(str, axes - {"time"}))):
-            raise ValueError(
-                f"a field over {' and '.join(space)} needs a zone to be averaged over: give "
-                "zone=ep.Zone(z=(FROM, TO)) in m, or ep.Zone() for all of it"
-            )
-        run = zone_average(field, zone, states=states, inputs=inputs, label=file)
-        return replace(
-            run,
-            parameters={name: float(value) for name, value in point.items()},
-            units={**run.units, **{name: value.attrs["units"] for name, value in point.items()}},
-        )
+            warnings.warn(words, stacklevel=3)
+        return points
+    listed = files_of(files)
+    places = Counter(Path(file).resolve() for file in listed)
+    if twice := [str(place) for place, n in places.items() if n > 1]:
+        raise ValueError(f"every file may come once: {twice[0]} comes again; leave one out")
+    return {file: {} for file in listed}
 
 
 def _parameter_in(

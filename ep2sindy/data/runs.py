@@ -22,15 +22,14 @@ if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
 
-TIMES = ("time", "t", "time_s", "t_s")  # accepted names of a table's time column, in seconds
-
-if TYPE_CHECKING:
     Run: TypeAlias = (
         Trajectory | pd.DataFrame | xr.Dataset | tuple[np.ndarray, np.ndarray] | np.ndarray
     )
     Runs: TypeAlias = Run | Sequence[Run] | Mapping[str, Run]
 else:  # pandas is not imported only to name a type
     Run = Runs = object
+
+TIMES = ("time", "t", "time_s", "t_s")  # accepted names of a table's time column, in seconds
 
 
 def trajectories_of(
@@ -205,7 +204,9 @@ def _from_table(table: pd.DataFrame, partial: bool) -> Trajectory:
         if not time_unit(table.index.name):
             table = table.rename_axis(index=TIMES[0])  # dates are times, whatever they are called
         table = table.reset_index(allow_duplicates=True)
-    table = table.set_axis([_word(name) for name in table.columns], axis="columns")
+    # A bare number gets an x, or it would look like a constant term.
+    words = [f"x{n}" if isinstance(n, int | np.integer) else str(n) for n in table.columns]
+    table = table.set_axis(words, axis="columns")
     if not table.columns.is_unique:
         raise ValueError(
             f"columns of a table must have names of their own, got {list(table.columns)}; rename "
@@ -254,11 +255,6 @@ def _present(
         words = describe_gaps(t[kept], len(t))
     warnings.warn(words, MissingSamples, stacklevel=5)
     return Trajectory(t[kept], values[kept], states, missing=missing, **kept_as_is)
-
-
-def _word(label: object) -> str:
-    """Name for a column. A bare number gets an x, or it would look like a constant term."""
-    return f"x{label}" if isinstance(label, int | np.integer) else str(label)
 
 
 def _elapsed(column: pd.Series) -> tuple[Float[np.ndarray, " rows"], Clock]:

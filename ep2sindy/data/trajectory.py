@@ -161,15 +161,13 @@ class Trajectory:
         """
         if self.missing is None:
             return self
-        kept = ~self.missing.any(axis=1)
+        kept: Bool[np.ndarray, " samples"] = np.logical_not(self.missing.any(axis=1))
         if kept.sum() < 2:
             raise ValueError(
                 f"two samples or more must hold all states: {self._lacking()}, and {kept.sum()} "
                 f"of {self.n_samples} hold all; TrajectorySearch() takes states of their own rates"
             )
-        return replace(
-            self, t=self.t[kept], states=self.states[kept], inputs=self.inputs[kept], missing=None
-        )
+        return self._at(kept)
 
     def _lacking(self) -> str:
         """How many samples every state lacks."""
@@ -220,13 +218,15 @@ class Trajectory:
                 f"a window must lie inside the trajectory: [{start}, {stop}) was asked of "
                 f"{self.n_samples} samples"
             )
-        part = slice(start, stop)
+        return self._at(slice(start, stop))
+
+    def _at(self, rows: slice | Bool[np.ndarray, " samples"]) -> Trajectory:
         return replace(
             self,
-            t=self.t[part],
-            states=self.states[part],
-            inputs=self.inputs[part],
-            missing=None if self.missing is None else self.missing[part],
+            t=self.t[rows],
+            states=self.states[rows],
+            inputs=self.inputs[rows],
+            missing=None if self.missing is None else self.missing[rows],
         )
 
     def segments(self, min_samples: int = MIN_SEGMENT) -> list[Trajectory]:

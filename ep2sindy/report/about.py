@@ -60,9 +60,8 @@ class About:
 
 def settings_used(settings: Mapping[str, Any], keys: Collection[str]) -> dict[str, str]:
     """The settings that a study uses, in words; unset ones are left out."""
-    shown = [key for key in settings if key in keys and key not in ASIDE]
-    rank = {key: k for k, key in enumerate(ASKED)}
-    ordered = sorted(shown, key=lambda key: rank.get(key, len(rank)))
+    used = {*settings} & {*keys} - {*ASIDE}
+    ordered = [key for key in dict.fromkeys([*ASKED, *settings]) if key in used]
     found = {ASKED.get(key, key.replace("_", " ")): setting_text(settings[key]) for key in ordered}
     bare = {n: text[1:-1] if text.startswith("(") else text for n, text in found.items()}
     return {name: text for name, text in bare.items() if text}

@@ -123,12 +123,10 @@ class Captioned:
 
 def cell_text(value: object) -> str:
     """A cell as text: numbers to three digits, NaN and None as a dash."""
-    if isinstance(value, Equation):
+    if isinstance(value, Equation | Link):
         return value.text
     if value is None or (isinstance(value, float) and value != value):
         return "-"
-    if isinstance(value, Link):
-        return value.text
     return f"{value:.3g}" if isinstance(value, float) else str(value)
 
 

@@ -60,7 +60,7 @@ def _environment() -> Environment:
         equation=equation_html,
         cell=cell_html,
         classes=_classes,
-        kind_of=_kind,
+        kind_of=lambda block: type(block).__name__,
         lines=_lines,
         math_font=b64encode((TEMPLATES / "math.woff2").read_bytes()).decode(),
     )
@@ -115,10 +115,6 @@ def _lines(blocks: Sequence[Block]) -> int:
     """How many lines these texts and equations take on a wide page."""
     texts = [block.text for block in blocks if isinstance(block, (Text, Equation))]
     return sum(-(-len(text) // CHARACTERS) for text in texts)
-
-
-def _kind(block: object) -> str:
-    return type(block).__name__
 
 
 def _classes(table: Table, row: int) -> str:

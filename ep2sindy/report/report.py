@@ -149,16 +149,15 @@ class Report:
         """Say what was found."""
         self.result = result
 
-    def say(self, text: str, *, warning: bool = False) -> None:
+    def say(self, text: str) -> None:
         """Print a message at once, on the screen and in run.log, and repeat it on the page."""
-        if not warning:
-            self.messages.append(text)
-        self.screen.print(*renderables(Text(text, warning=warning)))
+        self.messages.append(text)
+        self.screen.print(*renderables(Text(text)))
 
     def warn(self, text: str) -> None:
         """Print a warning at once, and repeat it on the page and in the summary."""
         self.warnings.append(text)
-        self.say(text, warning=True)
+        self.screen.print(*renderables(Text(text, warning=True)))
 
     def when_written(self, end: Callable[[], None]) -> None:
         """Do something once all that was found is written, such as removing what is kept."""
@@ -193,7 +192,14 @@ class Report:
         self.board.equations({name: model.text() for name, model in self.models.items()})
         hparams = {"seed": self.seed} | by_places(self.settings, keys)
         self.board.settings(hparams, self.headline)
-        about = self._about(purpose, keys)
+        about = About(
+            purpose=purpose,
+            asked=settings_used(self.settings, keys),
+            messages=self.messages,
+            warnings=self.warnings,
+            provenance=self.provenance,
+            config=(self.folder.path / "config.yaml").read_text("utf-8"),
+        )
         page = page_html(self.title, self.sections, drawn, about, result=self.result)
         write_text(self.folder.file(PAGE), page)
         named = {"experiment": self.title, "seed": self.seed}
@@ -213,16 +219,6 @@ class Report:
             self.board.image(name, png)
             drawn[name] = draw(figure, png, captioned.caption)
         return drawn
-
-    def _about(self, purpose: str, keys: Collection[str]) -> About:
-        return About(
-            purpose=purpose,
-            asked=settings_used(self.settings, keys),
-            messages=self.messages,
-            warnings=self.warnings,
-            provenance=self.provenance,
-            config=(self.folder.path / "config.yaml").read_text("utf-8"),
-        )
 
 
 def _once(kind: str, name: str, known: Collection[str]) -> None:

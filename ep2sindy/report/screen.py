@@ -14,16 +14,7 @@ from rich.measure import Measurement
 from rich.table import Table as RichTable
 from rich.text import Text as RichText
 
-from ep2sindy.report.document import (
-    Block,
-    Equation,
-    Picture,
-    Result,
-    Section,
-    Table,
-    Text,
-    cell_text,
-)
+from ep2sindy.report.document import Block, Equation, Result, Section, Table, Text, cell_text
 from ep2sindy.runtime.files import writing
 from ep2sindy.runtime.screen import on_screen, plain
 
@@ -99,8 +90,6 @@ def renderables(block: Block) -> Iterator[RenderableType]:
             yield _text(block.text)
         case Table(page_only=False):
             yield rich_table(block)
-        case Picture() | Text() | Equation() | Table():
-            pass
 
 
 def _print(console: Console, *renderables: RenderableType) -> None:

@@ -26,32 +26,26 @@ class Board:
 
     def scalars(self, scalars: Mapping[str, float], *, step: int) -> None:
         """Add points to curves that grow during the run."""
-        from tensorboard.compat.proto.summary_pb2 import Summary
-
-        values = [Summary.Value(tag=tag, simple_value=value) for tag, value in scalars.items()]
-        self._add(Summary(value=values), step=step)
+        values = [{"tag": tag, "simple_value": value} for tag, value in scalars.items()]
+        self._add({"value": values}, step=step)
 
     def equations(self, texts: Mapping[str, str]) -> None:
         """The equations of all models, by name, as one block of lines in a fixed-width font."""
         if not texts:
             return
-        from tensorboard.compat.proto.summary_pb2 import Summary
-        from tensorboard.compat.proto.tensor_pb2 import TensorProto
         from tensorboard.plugins.text.metadata import create_summary_metadata
 
         parts = (f"{name}\n{indent(text, '  ')}" for name, text in texts.items())
         lines = indent("\n\n".join(parts), "    ", lambda line: True)  # a block of code
-        tensor = TensorProto(dtype="DT_STRING", string_val=[lines.encode()])
+        tensor = {"dtype": "DT_STRING", "string_val": [lines.encode()]}
         kind = create_summary_metadata(display_name="equations", description="")
-        self._add(Summary(value=[Summary.Value(tag="equations", metadata=kind, tensor=tensor)]))
+        self._add({"value": [{"tag": "equations", "metadata": kind, "tensor": tensor}]})
 
     def image(self, name: str, png: bytes) -> None:
         """A figure, as the PNG drawn for the folder."""
-        from tensorboard.compat.proto.summary_pb2 import Summary
-
         width, height = struct.unpack(">II", png[16:24])  # in the PNG header
-        image = Summary.Image(height=height, width=width, colorspace=4, encoded_image_string=png)
-        self._add(Summary(value=[Summary.Value(tag=name, image=image)]))
+        size = {"height": height, "width": width, "colorspace": 4}
+        self._add({"value": [{"tag": name, "image": size | {"encoded_image_string": png}}]})
 
     def settings(self, hparams: Mapping[str, Any], metrics: Mapping[str, float]) -> None:
         """The metrics with the settings that led to them; TensorBoard compares runs by their keys.
@@ -70,6 +64,7 @@ class Board:
                 writer.close()
 
     def _add(self, summary: Any, *, step: int = 0) -> None:
+        """Add a summary, or the fields of one."""
         with writing(self._folder):
             if self._writer is None:
                 self._writer = _open(self._folder)

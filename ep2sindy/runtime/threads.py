@@ -35,13 +35,13 @@ def one_thread() -> Iterator[None]:
     """
     torch = sys.modules.get("torch")  # not imported here, since the import is slow
     n_threads = torch.get_num_threads() if torch else 1
-    _inside().enter(n_threads)
+    _INSIDE.enter(n_threads)
     try:
         if torch:
             torch.set_num_threads(1)
         yield
     finally:
-        n_before = _inside().leave()
+        n_before = _INSIDE.leave()
         if torch:
             torch.set_num_threads(max(n_threads, n_before))
 
@@ -71,9 +71,7 @@ class _Inside:
             return self.n_before
 
 
-@lru_cache(maxsize=1)
-def _inside() -> _Inside:
-    return _Inside()
+_INSIDE = _Inside()
 
 
 @lru_cache(maxsize=1)

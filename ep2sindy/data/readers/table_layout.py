@@ -261,11 +261,13 @@ def header_of(
         return numbered
     if not has_units and not is_comment:
         _check_names(above)
-    own = [_unit(cell) for cell in units]
-    header = split_names(names, [*own, *[""] * n_columns][:n_columns])
-    if header.names[0].lower() in TIMES and not any(header.units):
-        header = replace(header, units=_preamble_units(above, n_columns))
-    return replace(header, step_s=step_s)
+    parted = [split_name(name) for name in names]
+    below = [*map(_unit, units), *[""] * n_columns][:n_columns]
+    units = [_plain(unit) for unit in (below if any(below) else (unit for _, unit in parted))]
+    plain_names = _unique([name for name, _ in parted])
+    if plain_names[0].lower() in TIMES and not any(units):
+        units = _preamble_units(above, n_columns)
+    return Header(plain_names, tuple(units), step_s)
 
 
 def _check_names(above: Sequence[Sequence[str]]) -> None:
@@ -311,17 +313,14 @@ def _preamble_units(above: Sequence[Sequence[str]], n_columns: int) -> tuple[str
             time = units[0].lower() if unit_like(units[0].lower(), like="s") else units[0]
         elif units and UNITS_OF_VALUES.fullmatch(label):
             values = units
-    values = values * (n_columns - 1) if len(values) == 1 else [*values, *[""] * n_columns]
-    return tuple(unit if unit_like(unit) else "" for unit in map(_plain, [time, *values]))[
-        :n_columns
-    ]
+    values = values * (n_columns - 1) if len(values) == 1 else values
+    return _known_units([time, *values], n_columns)
 
 
-def split_names(names: Sequence[str], units: Sequence[str] = ()) -> Header:
-    """Header of columns whose names may hold units, as `Time (s)`; units: given elsewhere."""
-    parted = [split_name(name) for name in names]
-    units = units if any(units) else [unit for _, unit in parted]
-    return Header(_unique([name for name, _ in parted]), tuple(map(_plain, units)))
+def _known_units(cells: Sequence[str], n_columns: int) -> tuple[str, ...]:
+    """A unit for each column; "" for a cell that is none, and where there is no cell."""
+    units = [unit if unit_like(unit) else "" for unit in map(_plain, cells)]
+    return tuple([*units, *[""] * n_columns][:n_columns])
 
 
 def _step_s(above: Sequence[Sequence[str]]) -> float | None:
@@ -390,9 +389,8 @@ def _rigol_header(above: Sequence[Sequence[str]], n_columns: int) -> Header | No
         below = dict(zip(words, above[k + 1] if k + 1 < len(above) else [], strict=False))
         step = below.get("increment", "")
         if len(words) > n_columns and re.fullmatch(PLAIN["."], step):
-            units = [unit if unit_like(unit) else "" for unit in map(_plain, above[k + 1])]
-            units += [""] * n_columns
-            return Header(_unique(cells[:n_columns]), tuple(units[:n_columns]), float(step))
+            units = _known_units(above[k + 1], n_columns)
+            return Header(_unique(cells[:n_columns]), units, float(step))
     return None
 
 

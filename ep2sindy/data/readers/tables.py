@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import codecs
 import re
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TextIO
 
@@ -65,6 +64,7 @@ def _source(path: Path, file: TextIO) -> FileSource:
     columns = [j for j in numbers if j in layout.columns or _holds_numbers(frame[j])]
     others = [j for j in numbers if j not in columns]
     dates = _dates(frame, others)
+    left = {header.names[j]: frame[j] for j in others if j not in dates and frame[j].notna().any()}
     kept = sorted({*columns, *dates})
     names = {header.names[j]: j for j in kept}
     places = {str(j): j for j in kept} | names
@@ -76,7 +76,7 @@ def _source(path: Path, file: TextIO) -> FileSource:
 
     aliases = tuple(number for number in places if number not in names)
     return FileSource(
-        path, [*names], read, aliases=aliases, words=_words(frame, layout, columns, dates, others),
+        path, [*names], read, aliases=aliases, words=_words(layout, len(columns), len(dates), left),
         step_s=header.step_s, is_table=True,
     )  # fmt: skip
 
@@ -86,24 +86,16 @@ def _holds_numbers(column: pd.Series) -> bool:
     return column.dtype.kind in "fiu" and bool(column.notna().any())
 
 
-def _words(
-    frame: pd.DataFrame,
-    layout: Layout,
-    columns: Sequence[int],
-    dates: Mapping[int, pd.Series],
-    others: Sequence[int],
-) -> str:
-    """How the table was read, in words."""
-    n_columns, names = len(columns), layout.header.names
+def _words(layout: Layout, n_columns: int, n_dates: int, left: dict[str, pd.Series]) -> str:
+    """How the table was read, in words. left: columns that are left out."""
     words = f"{n_columns} column{'s' * (n_columns > 1)} of numbers"
-    words += f", {len(dates)} of dates" * bool(dates)
-    words += f" between {PARTED[layout.separator]}" * (n_columns + len(dates) > 1)
+    words += f", {n_dates} of dates" * bool(n_dates)
+    words += f" between {PARTED[layout.separator]}" * (n_columns + n_dates > 1)
     words += ", decimal commas" * (layout.decimal == ",")
     words += ", marks between thousands" * layout.has_marks
     words += f", rows from line {layout.first + 1}"
-    left = [j for j in others if j not in dates and frame[j].notna().any()]
-    words += f", left out: {', '.join(names[j] for j in left)}" * bool(left)
-    has_dates = any(frame[j].astype(str).str.match(SLASHED).all() for j in left)
+    words += f", left out: {', '.join(left)}" * bool(left)
+    has_dates = any(each.astype(str).str.match(SLASHED).all() for each in left.values())
     return words + "; dates are read if written as 2024-01-31" * has_dates
 
 
