@@ -53,7 +53,6 @@ from ep2sindy.thruster.axial.state_kernels import (
 from ep2sindy.thruster.balance import INFLOW
 from ep2sindy.thruster.cache import read_or_run
 from ep2sindy.thruster.parameters import OperatingPoint, Thruster
-from ep2sindy.thruster.plume import Plume
 from ep2sindy.thruster.propellants import describe_uncovered
 from ep2sindy.thruster.recording import CHUNK_ROWS, March, record_samples, warm_up
 from ep2sindy.thruster.verdict import outcome
@@ -174,13 +173,20 @@ def simulate_as(
     n_samples = sum(sample_counts(beginning, settings))
     with as_progress(progress).stage(n_samples, "sample", point.label) as advance:
         record = run(model, beginning, settings, advance, followers)
-    field = _dataset(record, model, settings, point, faces, thruster.plume)
+    plume, sample_s = thruster.plume, settings.sample_s
+    columns = field_columns(
+        charges=len(record.state.n_i), averaged=settings.averaged, spreads=plume is not None
+    )
+    cathode_V = point.voltage - float(model.supply[0])
+    series = series_of(record.series, model, cathode_V=cathode_V, sample_s=sample_s, plume=plume)
+    end = end_of(record.state)
+    field = labelled(columns, record.fields, series, end, sample_s=sample_s, faces=faces)
     field.attrs = {
         "title": "1-D axial Hall-thruster fluid model",
         "parameters": parameters,
         INFLOW: model.neutral_inflow,
         "initial": f"{start.label}, {beginning.note}" if beginning.note else start.label,
-        **_attributes(field, record, model, point, thruster, settings.sample_s),
+        **_attributes(field, record, model, point, thruster, sample_s),
     }
     return field
 
@@ -285,27 +291,6 @@ def _room(
     """Arrays for the fields and series of n_rows samples."""
     fields = np.empty((n_fields, n_rows, state.n_n.size - 2), np.float32)
     return fields, np.empty((n_rows, len(SERIES_SUMS)))
-
-
-def _dataset(
-    record: Record,
-    model: AxialModel,
-    settings: Settings,
-    point: OperatingPoint,
-    faces: Float[np.ndarray, " faces"],
-    plume: Plume | None,
-) -> xr.Dataset:
-    columns = field_columns(
-        charges=len(record.state.n_i), averaged=settings.averaged, spreads=plume is not None
-    )
-    fields = {
-        name: (record.fields[place], unit, text) for name, (place, unit, text) in columns.items()
-    }
-    offset = point.voltage - float(model.supply[0])  # the cathode's potential
-    sample_s = settings.sample_s
-    series = series_of(record.series, model, cathode_V=offset, sample_s=sample_s, plume=plume)
-    end = end_of(record.state)
-    return labelled(fields, series, end, sample_s=sample_s, faces=faces)
 
 
 def _attributes(
