@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -26,22 +26,21 @@ def set_profile(owner: object, places: str, name: str, positive_in: str | None) 
 
 def check_positive(owner: object, *names: str) -> None:
     """Raise ValueError for the first named field that is not a finite positive number."""
-    for name in names:
-        value = getattr(owner, name)
-        if not (math.isfinite(value) and value > 0.0):
-            raise ValueError(
-                f"{type(owner).__name__}.{name} must be finite and positive, got {value!r}"
-            )
+    _check_numbers(owner, names, lambda value: value > 0.0, "finite and positive")
 
 
 def check_not_negative(owner: object, *names: str) -> None:
     """Raise ValueError for the first named field that is negative or not finite."""
+    _check_numbers(owner, names, lambda value: value >= 0.0, "finite and zero or more")
+
+
+def _check_numbers(
+    owner: object, names: Sequence[str], in_range: Callable[[float], bool], what: str
+) -> None:
     for name in names:
         value = getattr(owner, name)
-        if not (math.isfinite(value) and value >= 0.0):
-            raise ValueError(
-                f"{type(owner).__name__}.{name} must be finite and zero or more, got {value!r}"
-            )
+        if not (math.isfinite(value) and in_range(value)):
+            raise ValueError(f"{type(owner).__name__}.{name} must be {what}, got {value!r}")
 
 
 def check_increasing(owner: object, name: str) -> None:
