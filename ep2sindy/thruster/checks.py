@@ -26,20 +26,22 @@ def set_profile(owner: object, places: str, name: str, positive_in: str | None) 
 
 def check_positive(owner: object, *names: str) -> None:
     """Raise ValueError for the first named field that is not a finite positive number."""
-    _check_numbers(owner, names, lambda value: value > 0.0, "finite and positive")
+    check_range(owner, "finite and positive", lambda value: value > 0.0, *names)
 
 
 def check_not_negative(owner: object, *names: str) -> None:
     """Raise ValueError for the first named field that is negative or not finite."""
-    _check_numbers(owner, names, lambda value: value >= 0.0, "finite and zero or more")
+    check_range(owner, "finite and zero or more", lambda value: value >= 0.0, *names)
 
 
-def _check_numbers(
-    owner: object, names: Sequence[str], in_range: Callable[[float], bool], what: str
-) -> None:
+def check_range(owner: object, what: str, holds: Callable[[float], bool], *names: str) -> None:
+    """Raise ValueError for the first named field that is not finite, or for which this fails.
+
+    what: that the field must be, in words.
+    """
     for name in names:
         value = getattr(owner, name)
-        if not (math.isfinite(value) and in_range(value)):
+        if not (math.isfinite(value) and holds(value)):
             raise ValueError(f"{type(owner).__name__}.{name} must be {what}, got {value!r}")
 
 
