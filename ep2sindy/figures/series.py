@@ -192,19 +192,17 @@ def limits_of(data: Curves, models: Sequence[Curves], rare: float = 0.0) -> list
 
 
 def _run_label(name: str, run: Rollout, statuses: Mapping[str, str]) -> str:
-    """The name, and below it the status if it is known; for a diverged run the time it lasted."""
-    status = when_it_diverges(run) if run.diverged else statuses.get(name)
+    """The name, and below it the status if it is known; for a diverged run the time it lasted.
+
+    `diverges at 182 µs` is counted from the run's start.
+    """
+    status = f"diverges at {run.lasted_text or 'once'}" if run.diverged else statuses.get(name)
     return f"{_label(name)}\n({status})" if status else _label(name)
 
 
 def _label(name: str) -> str:
     """A model's name in words, in lines that leave room for its panel."""
     return "\n".join(wrap(name.replace("_", " "), LABEL))
-
-
-def when_it_diverges(rollout: Rollout) -> str:
-    """`diverges at 182 µs`; the time is counted from the run's start."""
-    return f"diverges at {rollout.lasted_text or 'once'}"
 
 
 def phase_figure(
