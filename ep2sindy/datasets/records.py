@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.library.units import SECONDS, Clock
+from ep2sindy.library.units import Clock
 
 FOLDER = Path(__file__).parent
 
@@ -85,7 +85,7 @@ def _read(
     begins: float = 0.0,
 ) -> Trajectory:
     table = np.loadtxt(FOLDER / f"{name}.csv", delimiter=",", skiprows=1)
-    clock = SECONDS if unit == "s" else Clock.of(unit)
+    clock = Clock.of(unit)
     return Trajectory(
         t=(table[:, 0] - begins) * clock.seconds,
         states=table[:, 1:],

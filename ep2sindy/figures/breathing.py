@@ -37,13 +37,12 @@ def current_figure(field: xr.Dataset, window: slice) -> Figure:
     if "I_beam" in field:
         beam: dict[str, Any] = {"color": COLOURS[0], "ls": "--", "label": "ion beam current"}
         part.plot(time[window], shown["I_beam"].values, lw=1.3, **beam)
-    handles = list(part.lines)
     for ax in (whole, part):
         ax.set_ylabel("current (A)")
         ax.margins(x=0.0)
         _show_zero(ax)
     part.set_xlabel("time after the warm-up (ms)")
-    style.legend_above(figure, handles)
+    style.legend_above(figure, part.get_legend_handles_labels()[0])
     return figure
 
 

@@ -86,9 +86,12 @@ def _draw_scores(ax: Axes, front: ParetoFront, chosen: int | None, label: str) -
     """Draw the scores of runners-up, of the best of every size (line) and of the selected (star).
 
     The axis is linear near zero, where the best scores are. A candidate that cannot be run, such as
-    an equation without terms, has no finite score and is drawn at the upper edge.
+    an equation without terms, has no finite score and is drawn at the upper edge, at ten times the
+    largest finite score.
     """
-    _draw_candidates(ax, front, _finite(front.scores), chosen)
+    finite = np.isfinite(front.scores)
+    edge = 10.0 * max(front.scores[finite].max(initial=1.0), 1.0)
+    _draw_candidates(ax, front, np.where(finite, front.scores, edge), chosen)
     ax.set(ylabel=_score_label(label))
     ax.set_yscale("symlog", linthresh=1.0)
 
@@ -113,12 +116,6 @@ def _draw_candidates(ax: Axes, front: ParetoFront, heights: np.ndarray, chosen: 
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.margins(x=0.06)
     ax.grid(axis="y", alpha=0.25)
-
-
-def _finite(scores: np.ndarray) -> np.ndarray:
-    """The scores; infinite or missing ones become ten times the largest finite score."""
-    known = scores[np.isfinite(scores)]
-    return np.where(np.isfinite(scores), scores, 10.0 * max(known.max(initial=1.0), 1.0))
 
 
 def _draw_ensemble(ax: Axes, ensemble: Ensemble, *, label: str) -> None:

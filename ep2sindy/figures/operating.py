@@ -72,8 +72,8 @@ def laws_figure(
             line, points = style.sample_line(rows[along], along, held, law.parameters)
             ax.plot(line, law.functions.evaluate(points) @ factors, color=colour, lw=1.5)
             for kind, mark in (("law", FILLED), ("alone", OPEN)):
-                ends = rows[[f"{kind}_low", f"{kind}_high"]]
-                _draw_estimates(ax, rows[along], rows[kind], ends, {"color": colour, **mark})
+                of = rows[[kind, f"{kind}_low", f"{kind}_high"]]
+                _draw_estimates(ax, rows[along], of, {"color": colour, **mark})
         ax.set_xlabel(style.name_label(along, labels))
         ax.grid(alpha=0.3)
         _focus(ax, rows_at(coefficients, own)[["alone", "law"]].to_numpy(float))
@@ -115,15 +115,13 @@ def _choose_lines(
     return [groups[k] for k in chosen.round().astype(int)]
 
 
-def _draw_estimates(
-    ax: Axes,
-    x: pd.Series,
-    value: pd.Series,
-    ends: pd.DataFrame,
-    mark: Mapping[str, Any],
-) -> None:
-    """Draw marks at their x, with bars where the ends of an interval are known."""
-    reach = ends.sub(value, axis=0).abs().to_numpy(float).T
+def _draw_estimates(ax: Axes, x: pd.Series, of: pd.DataFrame, mark: Mapping[str, Any]) -> None:
+    """Draw marks at their x, with bars where the ends of an interval are known.
+
+    of: columns of the values and of the two ends.
+    """
+    value, *ends = of.to_numpy(float).T
+    reach = np.abs(ends - value)
     ax.errorbar(x, value, reach, ls="none", elinewidth=0.8, capsize=2, zorder=3, **mark)
 
 
@@ -315,7 +313,7 @@ def _draw_trend(
     """Draw estimates of one quantity with their intervals, and the law of the first kind."""
     for kind, mark in marks.items():
         of = rows_at(rows, {"kind": kind})
-        _draw_estimates(ax, of[along], of["value"], of[["low", "high"]], mark)
+        _draw_estimates(ax, of[along], of[["value", "low", "high"]], mark)
     x = rows_at(rows, {"kind": next(iter(marks))})[along]
     if law is not None and x.nunique() > 1:
         line, points = style.sample_line(x, along, at, law.functions.variables)

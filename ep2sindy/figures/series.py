@@ -7,7 +7,7 @@ preparation of curves: the part of a run to show, its limits and its labels.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import cycle
 from textwrap import wrap
 from types import MappingProxyType
@@ -42,25 +42,24 @@ def data_figure(run: Trajectory, *, duration_s: float, f_max_Hz: float | None = 
 
     f_max_Hz: None means harmonics of the fastest state, up to half the sampling rate.
     """
+    peaks_Hz = [dominant_frequency(run.t, column) for column in run.states.T]
     if f_max_Hz is None:
-        peaks_Hz = [dominant_frequency(run.t, column) for column in run.states.T]
         f_max_Hz = min(0.5 / run.dt_s, HARMONICS * float(np.nanmax([0.0, *peaks_Hz])) or np.inf)
     n = len(run.state_names)
     figure, axes = style.make_panels(n, 2, (WIDTH, 2.2 * n + 0.6), sharex="col", widths=[3, 2])
     states = first_part(run.t, run.states, duration_s, run.clock)
-    spectra = _spectra(run.t, run.states, f_max_Hz, run.clock)
-    for k, (row, name) in enumerate(zip(axes, run.state_names, strict=True)):
+    factor, unit = run.clock.frequency_scale(f_max_Hz)
+    for k, (row, name, peak_Hz) in enumerate(zip(axes, run.state_names, peaks_Hz, strict=True)):
         row[0].plot(states.x, states.y[:, k], color=DATA, lw=1)
         row[0].set_ylabel(style.axis_label(name, run.units[name]))
-        row[1].semilogy(spectra.x, spectra.y[:, k], color=COLOURS[0], lw=0.8)
-        peak_Hz = dominant_frequency(run.t, run.states[:, k])
-        peak = run.clock.frequency_scale(f_max_Hz)[0] * peak_Hz
+        frequency_Hz, power = _spectrum(run, k, f_max_Hz)
+        row[1].semilogy(factor * frequency_Hz, power, color=COLOURS[0], lw=0.8)
         text = run.clock.frequency_text(peak_Hz)
-        row[1].axvline(peak, color=COLOURS[1], lw=1, ls="--", label=text)
+        row[1].axvline(factor * peak_Hz, color=COLOURS[1], lw=1, ls="--", label=text)
         row[1].legend(loc="upper right", frameon=False)
         row[1].set_ylabel(f"power ({style.unit_text(_power_unit(run, name))})")
     axes[-1, 0].set_xlabel(_time_label(run.clock, duration_s))
-    axes[-1, 1].set_xlabel(_frequency_label(run.clock, f_max_Hz))
+    axes[-1, 1].set_xlabel(f"frequency ({unit})")
     return figure
 
 
@@ -98,8 +97,7 @@ def derivative_figure(
     for name, model in models.items():
         slopes = model.derivative(run.columns(model.states), run.columns(model.inputs))
         slopes = slopes[:, [model.states.index(state) for state in run.state_names]]
-        curves = first_part(run.t, clock.seconds * slopes, duration_s, clock)
-        sides.append(replace(curves, label=_label(name)))
+        sides.append(first_part(run.t, clock.seconds * slopes, duration_s, clock, _label(name)))
     titles = [style.slope_label(name, clock.rate_unit(run.units[name])) for name in run.state_names]
     x_label, limits = _time_label(clock, duration_s), limits_of(data, sides, RARE)
     return _draw_rows(data, sides, titles, x_label, limits)
@@ -134,29 +132,16 @@ def _draw_rows(
     return figure
 
 
-def _spectra(
-    t: Float[np.ndarray, " samples"],
-    states: Float[np.ndarray, "samples n_states"],
-    f_max_Hz: float,
-    clock: Clock,
-) -> Curves:
-    """Power of every state up to `f_max_Hz`; empty for a run that stopped at once."""
-    if len(t) < 8:
-        return Curves(np.empty(0), np.empty((0, states.shape[1])))
-    pairs = [power_spectrum(t, column) for column in states.T]
-    frequency = pairs[0][0]
-    power = np.stack([power for _, power in pairs], axis=1)
-    shown = (frequency > 0.0) & (frequency <= f_max_Hz)
+def _spectrum(run: Trajectory, k: int, f_max_Hz: float) -> style.Curve:
+    """Frequencies up to `f_max_Hz`, and the power of state k; empty for fewer than 8 samples."""
+    frequency_Hz, power = power_spectrum(run.t, run.states[:, k])
+    shown = (frequency_Hz > 0.0) & (frequency_Hz <= f_max_Hz) & (run.n_samples >= 8)
     drawable = np.maximum(power[shown], np.finfo(float).tiny)  # on a log scale
-    return Curves(clock.frequency_scale(f_max_Hz)[0] * frequency[shown], drawable / clock.seconds)
+    return frequency_Hz[shown], drawable / run.clock.seconds
 
 
 def _time_label(clock: Clock, duration_s: float, what: str = "time") -> str:
     return f"{what} ({clock.scale(duration_s)[1]})"
-
-
-def _frequency_label(clock: Clock, f_max_Hz: float) -> str:
-    return f"frequency ({clock.frequency_scale(f_max_Hz)[1]})"
 
 
 def _power_unit(run: Trajectory, name: str) -> str:
@@ -183,11 +168,12 @@ def first_part(
     values: Float[np.ndarray, "samples n_states"],
     duration_s: float,
     clock: Clock,
+    label: str = "",
 ) -> Curves:
     """The first `duration_s` of the values, over time in the clock's unit."""
     since = t - t[:1]
     shown = since <= duration_s
-    return Curves(clock.scale(duration_s)[0] * since[shown], values[shown])
+    return Curves(clock.scale(duration_s)[0] * since[shown], values[shown], label)
 
 
 def _runs(
@@ -195,10 +181,7 @@ def _runs(
 ) -> list[Curves]:
     """The first part of every run."""
     return [
-        replace(
-            first_part(run.t, run.states, duration_s, clock),
-            label=_run_label(name, run, statuses),
-        )
+        first_part(run.t, run.states, duration_s, clock, _run_label(name, run, statuses))
         for name, run in rollouts.items()
     ]
 
@@ -209,19 +192,17 @@ def limits_of(data: Curves, models: Sequence[Curves], rare: float = 0.0) -> list
 
 
 def _run_label(name: str, run: Rollout, statuses: Mapping[str, str]) -> str:
-    """The name, and below it the status if it is known; for a diverged run the time it lasted."""
-    status = when_it_diverges(run) if run.diverged else statuses.get(name)
+    """The name, and below it the status if it is known; for a diverged run the time it lasted.
+
+    `diverges at 182 µs` is counted from the run's start.
+    """
+    status = f"diverges at {run.lasted_text or 'once'}" if run.diverged else statuses.get(name)
     return f"{_label(name)}\n({status})" if status else _label(name)
 
 
 def _label(name: str) -> str:
     """A model's name in words, in lines that leave room for its panel."""
     return "\n".join(wrap(name.replace("_", " "), LABEL))
-
-
-def when_it_diverges(rollout: Rollout) -> str:
-    """`diverges at 182 µs`; the time is counted from the run's start."""
-    return f"diverges at {rollout.lasted_text or 'once'}"
 
 
 def phase_figure(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -124,7 +124,8 @@ def _averaged(field: xr.Dataset, zone: Zone) -> Terms:
 def _estimated(field: xr.Dataset, zone: Zone, *, axisymmetric: bool) -> Terms:
     """The terms that averages of the field's variables give, and what closes the balance."""
     t = grid_points(field, "time")
-    inside = zone_average(field, zone, states=DENSITIES, axisymmetric=axisymmetric)
+    average = partial(zone_average, states=DENSITIES, axisymmetric=axisymmetric)
+    inside = average(field, zone)
 
     def over_time(values: np.ndarray, run: Any) -> np.ndarray:
         """At all samples of the field; NaN where the average lacks one."""
@@ -135,10 +136,7 @@ def _estimated(field: xr.Dataset, zone: Zone, *, axisymmetric: bool) -> Terms:
         for name, values in zip(DENSITIES, inside.states.T, strict=True)
     }
     if "R_ion" in field:
-        products = ["n_i*n_n*R_ion"]
-        run = zone_average(
-            field, zone, states=DENSITIES, products=products, axisymmetric=axisymmetric
-        )
+        run = average(field, zone, products=["n_i*n_n*R_ion"])
         terms["ionization"] = over_time(run.inputs[:, 0], run)
     if "z" not in field.dims:
         return terms
@@ -148,27 +146,19 @@ def _estimated(field: xr.Dataset, zone: Zone, *, axisymmetric: bool) -> Terms:
     if "u_iz" in field:
 
         def flux(cell: int) -> np.ndarray:
-            run = zone_average(
-                field.isel(z=[cell]), None, states=DENSITIES, products=["n_i*u_iz"],
-                axisymmetric=axisymmetric,
-            )  # fmt: skip
+            run = average(field.isel(z=[cell]), None, products=["n_i*u_iz"])
             return over_time(run.inputs[:, 0], run) / length_m
 
         terms["exit_i"] = flux(inner[-1]) - (flux(inner[0] - 1) if inner[0] else 0.0)
     if inner[0] == 0 and INFLOW in field.attrs:
         terms["supply"] = np.full(len(t), float(field.attrs[INFLOW]) / length_m)
-    return _closed(terms)
-
-
-def _closed(terms: Mapping[str, np.ndarray]) -> Terms:
-    """The terms with those that the others leave: what the walls return, and neutrals that exit."""
-    found = dict(terms)
-    if {"ionization", "exit_i"} <= set(found):
-        found["returned"] = found["ionization"] - found["exit_i"] - found["change_i"]
-    if {"supply", "exit_i"} <= set(found):
-        changes = found["change_i"] + found["change_n"]
-        found["exit_n"] = found["supply"] - found["exit_i"] - changes
-    return found
+    # What the others leave: ions that the walls return, and neutrals that exit.
+    if {"ionization", "exit_i"} <= terms.keys():
+        terms["returned"] = terms["ionization"] - terms["exit_i"] - terms["change_i"]
+    if {"supply", "exit_i"} <= terms.keys():
+        changes = terms["change_i"] + terms["change_n"]
+        terms["exit_n"] = terms["supply"] - terms["exit_i"] - changes
+    return terms
 
 
 def _check_in_channel(field: xr.Dataset, beyond: int) -> None:

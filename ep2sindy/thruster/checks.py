@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -26,22 +26,23 @@ def set_profile(owner: object, places: str, name: str, positive_in: str | None) 
 
 def check_positive(owner: object, *names: str) -> None:
     """Raise ValueError for the first named field that is not a finite positive number."""
-    for name in names:
-        value = getattr(owner, name)
-        if not (math.isfinite(value) and value > 0.0):
-            raise ValueError(
-                f"{type(owner).__name__}.{name} must be finite and positive, got {value!r}"
-            )
+    check_range(owner, "finite and positive", lambda value: value > 0.0, *names)
 
 
 def check_not_negative(owner: object, *names: str) -> None:
     """Raise ValueError for the first named field that is negative or not finite."""
+    check_range(owner, "finite and zero or more", lambda value: value >= 0.0, *names)
+
+
+def check_range(owner: object, what: str, holds: Callable[[float], bool], *names: str) -> None:
+    """Raise ValueError for the first named field that is not finite, or for which this fails.
+
+    what: that the field must be, in words.
+    """
     for name in names:
         value = getattr(owner, name)
-        if not (math.isfinite(value) and value >= 0.0):
-            raise ValueError(
-                f"{type(owner).__name__}.{name} must be finite and zero or more, got {value!r}"
-            )
+        if not (math.isfinite(value) and holds(value)):
+            raise ValueError(f"{type(owner).__name__}.{name} must be {what}, got {value!r}")
 
 
 def check_increasing(owner: object, name: str) -> None:

@@ -12,7 +12,7 @@ from ep2sindy.thruster.checks import check_not_negative, check_positive, set_pro
 from ep2sindy.thruster.constants import K_BOLTZMANN
 from ep2sindy.thruster.magnetic_field import Field, MagneticField
 from ep2sindy.thruster.plume import Plume
-from ep2sindy.thruster.propellants import Propellant, XenonFits, gas_name
+from ep2sindy.thruster.propellants import Propellant, XenonFits
 from ep2sindy.thruster.transport import (
     AnomalousTransport,
     FunctionTransport,
@@ -303,7 +303,7 @@ class Thruster:
         if self.highest_charge > known:
             raise ValueError(
                 f"charge_states {self.charge_states} needs rates of every charge up to it, and the "
-                f"propellant {gas_name(self.propellant)} has them up to {known}; take "
+                f"propellant {self.propellant.name} has them up to {known}; take "
                 "ep2sindy.thruster.propellant(name='xenon')"
             )
         if self.propellant.range_eV is None:
@@ -312,7 +312,7 @@ class Thruster:
         for place, T_e_eV in (("anode", self.anode.T_e_eV), ("cathode", self.cathode_T_e_eV)):
             if not low <= T_e_eV <= high:
                 raise ValueError(
-                    f"the rates of {gas_name(self.propellant)} cover T_e from {low:g} to {high:g} "
+                    f"the rates of {self.propellant.name} cover T_e from {low:g} to {high:g} "
                     f"eV, and it is {T_e_eV:g} eV at the {place}; extend the table"
                 )
 

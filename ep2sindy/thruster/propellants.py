@@ -3,8 +3,8 @@
 All propellants have the same attributes and methods on arrays of T_e in eV, so that a simulation
 takes any of them:
 
-- `mass` (kg), `range_eV` (lowest and highest T_e that the coefficients cover, None for formulas),
-  `charge_states` (the highest charge that has coefficients), energies in eV;
+- `name`, `mass` (kg), `range_eV` (lowest and highest T_e that the coefficients cover, None for
+  formulas), `charge_states` (the highest charge that has coefficients), energies in eV;
 - `ionization`, `energy_loss`, `events`, `momentum`, `coulomb` for X and X+;
 - `drift_events`: the inelastic events that take their energy from drift and heat together;
 - `further_ionization(charge, higher, T_e_eV)` and `further_energy(charge, higher)` of what makes
@@ -68,16 +68,6 @@ def excitation_rate(T_e_eV: FloatArray) -> FloatArray:
     return 1.93e-19 * np.exp(-11.6 / T_e_eV) / np.sqrt(T_e_eV) * thermal_speed(T_e_eV)
 
 
-def momentum_transfer_rate(T_e_eV: FloatArray) -> FloatArray:
-    """Rate coefficient of electron-neutral momentum transfer, in m^3/s.
-
-    The fit turns negative below 0.4 eV, where it is held at zero.
-    Source: Goebel & Katz, chapter 3.
-    """
-    sigma = 6.6e-19 * (T_e_eV / 4.0 - 0.1) / (1.0 + (T_e_eV / 4.0) ** 1.6)  # m^2
-    return np.maximum(sigma, 0.0) * thermal_speed(T_e_eV)
-
-
 def coulomb_rate(T_e_eV: FloatArray) -> FloatArray:
     """2.9e-12 T^-1.5; times n and ln(Lambda) it gives nu_ei in 1/s (Goebel & Katz, chapter 3)."""
     return 2.9e-12 * T_e_eV**-1.5
@@ -108,6 +98,7 @@ class XenonFits:
     """
 
     drift_weight: float = 1.0
+    name: ClassVar[str] = "XenonFits"
     mass: ClassVar[float] = M_XENON
     ionization_eV: ClassVar[float] = E_IONIZATION_EV
     range_eV: ClassVar[tuple[float, float] | None] = None
@@ -134,8 +125,13 @@ class XenonFits:
         return np.zeros_like(T_e_eV)
 
     def momentum(self, T_e_eV: FloatArray) -> FloatArray:
-        """Momentum lost to neutrals in elastic collisions, in m^3/s."""
-        return momentum_transfer_rate(T_e_eV)
+        """Momentum lost to neutrals in elastic collisions, in m^3/s.
+
+        The fit turns negative below 0.4 eV, where it is held at zero.
+        Source: Goebel & Katz, chapter 3.
+        """
+        sigma = 6.6e-19 * (T_e_eV / 4.0 - 0.1) / (1.0 + (T_e_eV / 4.0) ** 1.6)  # m^2
+        return np.maximum(sigma, 0.0) * thermal_speed(T_e_eV)
 
     def coulomb(self, T_e_eV: FloatArray) -> FloatArray:
         """nu_ei divided by n and ln(Lambda)."""
@@ -279,11 +275,6 @@ class PropellantTable:
 Propellant = XenonFits | PropellantTable
 
 
-def gas_name(propellant: Propellant) -> str:
-    """Name of a gas in messages."""
-    return propellant.name if isinstance(propellant, PropellantTable) else type(propellant).__name__
-
-
 def describe_uncovered(propellant: Propellant, reached_eV: float) -> str | None:
     """Message if a run needed rates beyond those that there are; otherwise None.
 
@@ -295,6 +286,6 @@ def describe_uncovered(propellant: Propellant, reached_eV: float) -> str | None:
     top = propellant.range_eV[1]
     energy = "T_e + 2K/3 (K: energy of the electrons' drift)" if propellant.drift_weight else "T_e"
     return (
-        f"the rates of {gas_name(propellant)} cover T_e up to {top:g} eV, and the run reached "
+        f"the rates of {propellant.name} cover T_e up to {top:g} eV, and the run reached "
         f"{energy} of {reached_eV:g} eV, where the value at {top:g} eV is taken; extend the table"
     )

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.thruster.checks import check_not_negative, check_positive, set_profile
+from ep2sindy.thruster.checks import check_not_negative, check_positive, check_range, set_profile
 from ep2sindy.thruster.walls import fraction
 from ep2sindy.trust.user_code import identify, load_marked
 
@@ -90,10 +90,8 @@ class GaussianTransport:
 
     def __post_init__(self) -> None:
         check_positive(self, "c_far", "trough", "width")
-        if self.trough > 1.0:
-            raise ValueError(f"GaussianTransport.trough must be at most 1, got {self.trough!r}")
-        if not np.isfinite(self.center):
-            raise ValueError(f"GaussianTransport.center must be finite, got {self.center!r}")
+        check_range(self, "at most 1", lambda value: value <= 1.0, "trough")
+        check_range(self, "finite", lambda _: True, "center")
 
     def at(self, distance: Float[np.ndarray, " z"]) -> Float[np.ndarray, " z"]:
         """Coefficient c at a distance from the exit in m."""
@@ -176,8 +174,7 @@ class PressureShift:
 
     def __post_init__(self) -> None:
         check_positive(self, "pressure_Pa")
-        if not (np.isfinite(self.alpha) and self.alpha > 1.0):
-            raise ValueError(f"PressureShift.alpha must be above 1, got {self.alpha!r}")
+        check_range(self, "above 1", lambda value: value > 1.0, "alpha")
         if not np.isfinite([self.z0, self.dz]).all():
             raise ValueError(
                 f"PressureShift.z0 and dz must be finite, in channel lengths, got {self.z0!r} and "

@@ -8,7 +8,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.thruster.checks import check_not_negative, check_positive
+from ep2sindy.thruster.checks import check_not_negative, check_positive, check_range
 from ep2sindy.thruster.constants import E_CHARGE, M_ELECTRON
 
 SHEATH_DENSITY_RATIO = 0.4965  # edge over mean density, 0.86 / sqrt(3) (Marks et al. 2023)
@@ -111,8 +111,7 @@ class SheathWall:
             self, "yield_0", "electron_scale", "ion_scale", "plume_collisions", "plume_power",
             "transition",
         )  # fmt: skip
-        if self.yield_0 >= 1.0:
-            raise ValueError(f"SheathWall.yield_0 must be below 1, got {self.yield_0!r}")
+        check_range(self, "below 1", lambda value: value < 1.0, "yield_0")
 
     def emission(self, T_e_eV: FloatArray, ion_mass: float) -> FloatArray:
         """Secondary electrons per primary, held at the space-charge limit."""

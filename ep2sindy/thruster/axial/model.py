@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -179,8 +180,12 @@ def followers_of(
     """What is set anew before each sample, from the state. Sets the first areas of a plume."""
     followers: list[Follower] = []
     if thruster.plume is not None:
-        spreading = Spreading(thruster, model, state, faces)
-        followers += [spreading.follow] if spreading.follows else []
+        spreading = Spreading(thruster, model, state, faces - thruster.channel_length)
+        if isinstance(thruster.plume, ThermalPlume):
+            followers.append(spreading.follow)
+        else:
+            state.tangent[:] = spreading.target()
+        spreading.set_areas()
     if isinstance(thruster.transport, FunctionTransport):
         followers.append(_transport(thruster.transport, thruster, model, state, faces))
     return followers
@@ -208,27 +213,20 @@ def _transport(
     return follow
 
 
+@dataclass(frozen=True, eq=False)
 class Spreading:
     """Areas of a model, from the tangents of its plume's half-angle in the state.
 
     Those of a `ThermalPlume` follow the plasma from sample to sample, with a delay of DELAY_S.
+    from_exit: places of the faces beyond the exit in m.
     """
 
-    def __init__(
-        self,
-        thruster: Thruster,
-        model: AxialModel,
-        state: AxialState,
-        faces: Float[np.ndarray, " faces"],
-    ) -> None:
-        self.thruster, self.model, self.state = thruster, model, state
-        self.from_exit = faces - thruster.channel_length
-        self.follows = isinstance(thruster.plume, ThermalPlume)
-        if not self.follows:
-            state.tangent[:] = self._target()
-        self._set_areas()
+    thruster: Thruster
+    model: AxialModel
+    state: AxialState
+    from_exit: Float[np.ndarray, " faces"]
 
-    def _target(self) -> Float[np.ndarray, " cells"]:
+    def target(self) -> Float[np.ndarray, " cells"]:
         """Tangents that belong to the present plasma."""
         state, plume = self.state, self.thruster.plume
         assert plume is not None
@@ -236,7 +234,8 @@ class Spreading:
         mean = state.flux_i.sum(axis=0) / state.n_i.sum(axis=0)
         return plume.tangents(mean, exit_T_e_eV=exit_T_e, ion_mass=self.model.ion_mass)
 
-    def _set_areas(self) -> None:
+    def set_areas(self) -> None:
+        """Set the areas of the model by the tangents of the state."""
         state, model = self.state, self.model
         at_faces = 0.5 * (state.tangent[1:] + state.tangent[:-1])
         inner, outer = self.thruster.inner_radius, self.thruster.outer_radius
@@ -253,8 +252,8 @@ class Spreading:
         """Let the areas follow the plasma by one sample; what a cell holds spreads over them."""
         state, before = self.state, self.model.spread.copy()
         fraction = -np.expm1(-sample_s / DELAY_S)
-        state.tangent[:] += fraction * (self._target() - state.tangent)
-        self._set_areas()
+        state.tangent[:] += fraction * (self.target() - state.tangent)
+        self.set_areas()
         thinner = before / self.model.spread
         for each in (state.n_i, state.flux_i, state.n_n, state.energy):
             each *= thinner

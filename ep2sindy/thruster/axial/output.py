@@ -111,18 +111,19 @@ def series_of(
 
 
 def labelled(
-    fields: Mapping[str, tuple[Float[np.ndarray, "samples cells"], str, str]],
+    columns: Mapping[str, tuple[int, str, str]],
+    fields: Float[np.ndarray, "sums samples cells"],
     series: Mapping[str, Float[np.ndarray, " samples"]],
     end: Mapping[str, tuple[Float[np.ndarray, " cells"], str]],
     *,
     sample_s: float,
     faces: Float[np.ndarray, " faces"],
 ) -> xr.Dataset:
-    """Label the recorded arrays with dimensions, units and names."""
+    """Label the recorded arrays with dimensions, units and names. columns: by `field_columns`."""
     data: dict[str, Any] = {}
-    for name, (values, unit, text) in fields.items():
-        data[name] = (("time", "z"), values, notes(unit, text))
-        if name in PRODUCTS and (name != "ionization" or "n_i2" not in fields):
+    for name, (place, unit, text) in columns.items():
+        data[name] = (("time", "z"), fields[place], notes(unit, text))
+        if name in PRODUCTS and (name != "ionization" or "n_i2" not in columns):
             data[name][-1]["average_of"] = PRODUCTS[name]
         if name in FACE_PRODUCTS:
             data[name][-1][FACES] = FACE_PRODUCTS[name]

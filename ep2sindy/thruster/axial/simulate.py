@@ -53,7 +53,6 @@ from ep2sindy.thruster.axial.state_kernels import (
 from ep2sindy.thruster.balance import INFLOW
 from ep2sindy.thruster.cache import read_or_run
 from ep2sindy.thruster.parameters import OperatingPoint, Thruster
-from ep2sindy.thruster.plume import Plume
 from ep2sindy.thruster.propellants import describe_uncovered
 from ep2sindy.thruster.recording import CHUNK_ROWS, March, record_samples, warm_up
 from ep2sindy.thruster.verdict import outcome
@@ -174,13 +173,20 @@ def simulate_as(
     n_samples = sum(sample_counts(beginning, settings))
     with as_progress(progress).stage(n_samples, "sample", point.label) as advance:
         record = run(model, beginning, settings, advance, followers)
-    field = _dataset(record, model, settings, point, faces, thruster.plume)
+    plume, sample_s = thruster.plume, settings.sample_s
+    columns = field_columns(
+        charges=len(record.state.n_i), averaged=settings.averaged, spreads=plume is not None
+    )
+    cathode_V = point.voltage - float(model.supply[0])
+    series = series_of(record.series, model, cathode_V=cathode_V, sample_s=sample_s, plume=plume)
+    end = end_of(record.state)
+    field = labelled(columns, record.fields, series, end, sample_s=sample_s, faces=faces)
     field.attrs = {
         "title": "1-D axial Hall-thruster fluid model",
         "parameters": parameters,
         INFLOW: model.neutral_inflow,
         "initial": f"{start.label}, {beginning.note}" if beginning.note else start.label,
-        **_attributes(field, record, model, point, thruster, settings.sample_s),
+        **_attributes(field, record, model, point, thruster, sample_s),
     }
     return field
 
@@ -221,9 +227,7 @@ def run(
     followers: Sequence[Follower] = (),
 ) -> Record:
     """Hold, warm up and record; a run that breaks ends with its last complete sample."""
-    state = beginning.state
-    n_fields = len(CELL_SUMS) + PER_CHARGE * (len(state.n_i) - 1)
-    quiet = model
+    state, quiet = beginning.state, model
     if beginning.resistance is not None:
         quiet = model._replace(resistance=beginning.resistance)
     n_hold, n_warm_up, n_samples = sample_counts(beginning, settings)
@@ -232,11 +236,11 @@ def run(
         follow(0.0)
     whole = beginning.whole or first_fields(state, model)
     for each, n_rows in ((quiet, n_hold), (model, n_warm_up)):
-        march = _march(each, state, settings, *_room(n_fields, CHUNK_ROWS, state), followers)
+        march, *_ = _march(each, state, settings, CHUNK_ROWS, followers)
         whole = whole and warm_up(march, n_rows, advance) is None
     before, state.hottest_eV[0], state.clock[0] = stored_energy(state, model), 0.0, 0.0
-    fields, series = _room(n_fields, n_samples if whole else 0, state)
-    march = _march(model, state, settings, fields, series, followers)
+    n_rows = n_samples if whole else 0
+    march, fields, series = _march(model, state, settings, n_rows, followers)
     filled = record_samples(march, len(series), advance)
     return Record(
         fields[:, :filled],
@@ -257,12 +261,17 @@ def _march(
     model: AxialModel,
     state: AxialState,
     settings: Settings,
-    fields: np.ndarray,
-    series: np.ndarray,
+    n_rows: int,
     followers: Sequence[Follower],
-) -> March:
-    """A function that records samples of a run into a slice of rows of these arrays."""
-    sums, work = new_sums(len(fields), state.n_n.size), new_work(*state.n_i.shape)
+) -> tuple[March, Float[np.ndarray, "sums samples cells"], Float[np.ndarray, "samples series"]]:
+    """A function that records samples of a run into a slice of rows, and what it fills.
+
+    These are the fields and series of n_rows samples.
+    """
+    n_fields, n_cells = len(CELL_SUMS) + PER_CHARGE * (len(state.n_i) - 1), state.n_n.size
+    fields = np.empty((n_fields, n_rows, n_cells - 2), np.float32)
+    series = np.empty((n_rows, len(SERIES_SUMS)))
+    sums, work = new_sums(n_fields, n_cells), new_work(*state.n_i.shape)
 
     def march(rows: slice) -> int:
         recorded = settings.sample_s, settings.averaged, fields[:, rows], series[rows]
@@ -276,36 +285,7 @@ def _march(
                 return row - rows.start
         return rows.stop - rows.start
 
-    return march_by_samples if followers else march
-
-
-def _room(
-    n_fields: int, n_rows: int, state: AxialState
-) -> tuple[Float[np.ndarray, "sums samples cells"], Float[np.ndarray, "samples series"]]:
-    """Arrays for the fields and series of n_rows samples."""
-    fields = np.empty((n_fields, n_rows, state.n_n.size - 2), np.float32)
-    return fields, np.empty((n_rows, len(SERIES_SUMS)))
-
-
-def _dataset(
-    record: Record,
-    model: AxialModel,
-    settings: Settings,
-    point: OperatingPoint,
-    faces: Float[np.ndarray, " faces"],
-    plume: Plume | None,
-) -> xr.Dataset:
-    columns = field_columns(
-        charges=len(record.state.n_i), averaged=settings.averaged, spreads=plume is not None
-    )
-    fields = {
-        name: (record.fields[place], unit, text) for name, (place, unit, text) in columns.items()
-    }
-    offset = point.voltage - float(model.supply[0])  # the cathode's potential
-    sample_s = settings.sample_s
-    series = series_of(record.series, model, cathode_V=offset, sample_s=sample_s, plume=plume)
-    end = end_of(record.state)
-    return labelled(fields, series, end, sample_s=sample_s, faces=faces)
+    return (march_by_samples if followers else march), fields, series
 
 
 def _attributes(

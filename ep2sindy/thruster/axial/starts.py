@@ -126,8 +126,7 @@ class ColdStart:
 
     def begin(self, model: AxialModel, z: Profile, parameters: str) -> Beginning:
         n_i, T_e = np.full(z.size, self.n_i), np.full(z.size, self.T_e_eV)
-        n_n = _gas(model)
-        return Beginning(_state(parameters, [n_i], [self.u_i * n_i], n_n, T_e))
+        return Beginning(_state(parameters, [n_i], [self.u_i * n_i], _gas(model), T_e))
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import numpy as np
 import xarray as xr
 from jaxtyping import Float
 
-from ep2sindy.runtime.progress import Advance, Progress, as_progress
+from ep2sindy.runtime.progress import Progress, as_progress
 from ep2sindy.thruster.axial.settings import Settings, to_json
 from ep2sindy.thruster.balance import INFLOW
 from ep2sindy.thruster.cache import read_or_run
@@ -153,10 +153,15 @@ def simulate_as(
     grid = MaskedGrid(thruster, settings["n_z"], settings["n_r"])
     model = build_model(thruster, operating_point, grid)
     n_warm_up, n_samples = round(warm_up_s / sample_s), round(duration_s / sample_s) + 1
-    watch = as_progress(progress)
+    state, watch = initial_state(grid, model), as_progress(progress)
+    rows = Rows.allocate(min(n_warm_up, CHUNK_ROWS), grid)
     with watch.stage(n_warm_up + n_samples, "sample", operating_point.label) as advance:
-        rows = warmed_up_run(grid, model, n_warm_up, n_samples, sample_s, averaged, advance)
-    field = labelled(rows, sample_s, grid)
+        n_rows = warm_up(rows.march(state, model, sample_s, averaged), n_warm_up, advance)
+        if n_rows is None:  # if the warm-up diverges, its last finite samples are the record
+            rows = Rows.allocate(n_samples, grid)
+            march = rows.march(state, model, sample_s, averaged)
+            n_rows = record_samples(march, n_samples, advance)
+    field = labelled(rows.until(n_rows), sample_s, grid)
     drop = thruster.series_resistance * field["I_d"].values
     field["V_d"] = ("time", operating_point.voltage - drop, notes(*SERIES["V_d"]))
     parameters = {"thruster": thruster, "operating_point": operating_point, "settings": settings}
@@ -165,8 +170,11 @@ def simulate_as(
         "note": "electrons are quasi-one-dimensional: T_e_eV, R_ion and E_z depend on z alone",
         "parameters": to_json(parameters),
         INFLOW: model.neutral_inflow,
-        **diagnose(field, operating_point, model.ion_mass, diverged=len(rows.series) < n_samples),
+        "initial": "guessed profiles",
+        **outcome(field, operating_point, ion_mass=model.ion_mass, diverged=n_rows < n_samples),
     }
+    if field.sizes["time"] > 1:
+        field.attrs["mass_balance"] = mass_balance(field, operating_point)
     return field
 
 
@@ -202,27 +210,6 @@ class Rows:
         return march
 
 
-def warmed_up_run(
-    grid: MaskedGrid,
-    model: PlaneModel,
-    n_warm_up: int,
-    n_samples: int,
-    sample_s: float,
-    averaged: bool,
-    advance: Advance,
-) -> Rows:
-    """The samples after the warm-up; if the warm-up diverges, its last finite samples."""
-    state = initial_state(grid, model)
-    rows = Rows.allocate(min(n_warm_up, CHUNK_ROWS), grid)
-    broken = warm_up(rows.march(state, model, sample_s, averaged), n_warm_up, advance)
-    if broken is not None:
-        return rows.until(broken)
-    rows = Rows.allocate(n_samples, grid)
-    return rows.until(
-        record_samples(rows.march(state, model, sample_s, averaged), n_samples, advance)
-    )
-
-
 def labelled(rows: Rows, sample_s: float, grid: MaskedGrid) -> xr.Dataset:
     """Label the sampled arrays with dimensions, units and names, without copying the planes."""
     data: dict[str, tuple] = {
@@ -234,17 +221,6 @@ def labelled(rows: Rows, sample_s: float, grid: MaskedGrid) -> xr.Dataset:
     for k, name in enumerate(list(SERIES)[:-1]):
         data[name] = (("time",), rows.series[:, k].copy(), notes(*SERIES[name]))
     return as_dataset(data, sample_s=sample_s, n_samples=len(rows.series), z=grid.z, r=grid.r)
-
-
-def diagnose(
-    field: xr.Dataset, point: OperatingPoint, ion_mass: float, *, diverged: bool
-) -> dict[str, Any]:
-    """Status, cycle, frequency, current, performance and mass balance."""
-    found: dict[str, Any] = {"initial": "guessed profiles"}
-    found |= outcome(field, point, ion_mass=ion_mass, diverged=diverged)
-    if field.sizes["time"] > 1:
-        found["mass_balance"] = mass_balance(field, point)
-    return found
 
 
 def mass_balance(field: xr.Dataset, point: OperatingPoint) -> float:
