@@ -39,6 +39,7 @@ LEAST_FACTOR = 0.03
 DROWNED = 0.5
 
 Columns = dict[str, Samples]
+Terms = Bool[np.ndarray, " terms"]
 
 
 @dataclass(frozen=True)
@@ -256,7 +257,7 @@ def _insert_states(run: Trajectory, known: Columns, units: Mapping[str, str]) ->
         )
 
 
-def _linear_in(library: Library, name: str, others: Sequence[str]) -> Bool[np.ndarray, " terms"]:
+def _linear_in(library: Library, name: str, others: Sequence[str]) -> Terms:
     """Terms that are this variable times others alone; for no name, terms of the others."""
     of = np.array([*library.variables, *(function.variable for function in library.functions)])
     found = ~library.exponents[:, ~np.isin(of, [name, *others])].any(axis=1)
@@ -266,19 +267,13 @@ def _linear_in(library: Library, name: str, others: Sequence[str]) -> Bool[np.nd
     return np.asarray(found)
 
 
-def _evaluate(
-    library: Library, rows: Bool[np.ndarray, " terms"], known: Columns
-) -> Float[np.ndarray, "samples rows"]:
+def _evaluate(library: Library, rows: Terms, known: Columns) -> Float[np.ndarray, "samples rows"]:
     own = library.take(rows).over(list(known))
     return own.evaluate(np.stack(list(known.values()), axis=1))
 
 
 def _fixed_by(
-    relation: Relation,
-    hidden: str,
-    library: Library,
-    own: Bool[np.ndarray, " terms"],
-    before: Sequence[str],
+    relation: Relation, hidden: str, library: Library, own: Terms, before: Sequence[str]
 ) -> Coupling | None:
     """The coupling whose coefficient a relation fixes; None if it fixes none."""
     if len(relation.factors) != 1 or not relation.value:
