@@ -226,6 +226,13 @@ class DiscoveryProblem:
         """Between coefficients, at the operating point of the first run."""
         return self.library.at_operating_point(self.runs[0].parameters).facts.relations
 
+    @property
+    def theta(self) -> Float[np.ndarray, "samples terms"]:
+        """The terms of the library at the samples of all runs."""
+        variables = self.library.variables
+        values = [noise_inside(self.library, run.columns(variables)) for run in self.runs]
+        return self.library.evaluate(np.concatenate(values))
+
     def complete(
         self, equation: str, found: Sequence[Bool[np.ndarray, "_ terms"]]
     ) -> list[Bool[np.ndarray, "_ terms"]]:

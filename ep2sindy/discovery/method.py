@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool
 
-from ep2sindy.data.coerce import DiscoveryProblem, noise_inside
+from ep2sindy.data.coerce import DiscoveryProblem
 from ep2sindy.data.numbers import column_norms
 from ep2sindy.data.sensor import bounds_of
 from ep2sindy.data.trajectory import Trajectory
@@ -204,11 +204,9 @@ def _front(
 
 def _ambiguities_of_samples(task: DiscoveryProblem) -> tuple[Ambiguity, ...]:
     """Terms whose values at the samples cannot be distinguished."""
-    library = task.library
-    values = [noise_inside(library, run.columns(library.variables)) for run in task.runs]
-    theta = library.evaluate(np.concatenate(values))
+    theta = task.theta
     theta = theta / column_norms(theta)
-    return find_ambiguities(library, lambda: theta, theta.T @ theta)
+    return find_ambiguities(task.library, lambda: theta, theta.T @ theta)
 
 
 @dataclass(frozen=True, eq=False)

@@ -89,7 +89,7 @@ class PointsProblem:
     ) -> Discovery:
         """One support for all points, its coefficients at each, and their law if one is asked."""
         problems = self._rows(rng, progress)
-        fronts = self._fronts(problems, progress)
+        fronts = search_shared(problems, self.asked, self.regression, progress=progress)
         rows = fit_rows(
             self.parameters, self.values, list(problems.values()), self._relations(fronts),
             provenance=self.regression.provenance,
@@ -135,11 +135,6 @@ class PointsProblem:
             for label in labels
         }
         return {label: rows[label] for label in self.points}
-
-    def _fronts(
-        self, problems: Mapping[str, Sequence[RegressionRows]], progress: Progress
-    ) -> list[SharedFront]:
-        return search_shared(problems, self.asked, self.regression, progress=progress)
 
     def _relations(self, fronts: Sequence[SharedFront]) -> LawConstraint:
         """The terms of all points, with their relations."""

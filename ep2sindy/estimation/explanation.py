@@ -424,7 +424,7 @@ def unobserved_state(problem: EstimationProblem) -> str:
     path of two states in their plane cannot cross itself.
     """
     d = len(problem.states)
-    if problem.driven or d > 2 or not problem.measured.all():
+    if problem.inputs or d > 2 or not problem.measured.all():
         return ""
     smooth, _, noise = smooth_states(problem, None)
     paths = [_clear_steps(path) for path in problem.split(smooth / noise)]

@@ -29,7 +29,7 @@ from ep2sindy.library.units import unit_product
 from ep2sindy.model.model import SparseModel
 from ep2sindy.signals.signal import is_positive
 from ep2sindy.signals.smoothers import KalmanSmoother
-from ep2sindy.signals.spectrum import signal_memory_s
+from ep2sindy.signals.spectrum import Samples, signal_memory_s
 
 # Fraction of a factor's mean square that weighs a hidden state's mean against what its rate tells:
 # where the factor is small, this is little.
@@ -38,7 +38,8 @@ LEAST_FACTOR = 0.03
 # Noise, in standard deviations of a signal, from which a smoother is suspected to take it for that.
 DROWNED = 0.5
 
-Columns = dict[str, Float[np.ndarray, " samples"]]
+Columns = dict[str, Samples]
+Terms = Bool[np.ndarray, " terms"]
 
 
 @dataclass(frozen=True)
@@ -196,9 +197,7 @@ def with_guess_by(model: SparseModel, run: Trajectory, *, follow: bool = False) 
     return _insert_states(run, known, units)
 
 
-def _infer_state(
-    model: SparseModel, name: str, known: Columns, rates: Columns
-) -> Float[np.ndarray, " samples"] | None:
+def _infer_state(model: SparseModel, name: str, known: Columns, rates: Columns) -> Samples | None:
     """A state by the first equation of a known state that it enters; None if it enters none.
 
     States that are not known yet count as zero; the equation is linearised there.
@@ -239,9 +238,7 @@ def _add_state(
     known[name], rates[name] = values, make_interp_spline(run.t, values, k=3).derivative()(run.t)
 
 
-def _quotient(
-    rate: Float[np.ndarray, " samples"], factor: Float[np.ndarray, " samples"]
-) -> Float[np.ndarray, " samples"]:
+def _quotient(rate: Samples, factor: Samples) -> Samples:
     """Their quotient, drawn to its mean where the factor is small."""
     square = np.square(factor)
     least, mean = LEAST_FACTOR * square.mean(), (rate @ factor) / square.sum()
@@ -260,7 +257,7 @@ def _insert_states(run: Trajectory, known: Columns, units: Mapping[str, str]) ->
         )
 
 
-def _linear_in(library: Library, name: str, others: Sequence[str]) -> Bool[np.ndarray, " terms"]:
+def _linear_in(library: Library, name: str, others: Sequence[str]) -> Terms:
     """Terms that are this variable times others alone; for no name, terms of the others."""
     of = np.array([*library.variables, *(function.variable for function in library.functions)])
     found = ~library.exponents[:, ~np.isin(of, [name, *others])].any(axis=1)
@@ -270,19 +267,13 @@ def _linear_in(library: Library, name: str, others: Sequence[str]) -> Bool[np.nd
     return np.asarray(found)
 
 
-def _evaluate(
-    library: Library, rows: Bool[np.ndarray, " terms"], known: Columns
-) -> Float[np.ndarray, "samples rows"]:
+def _evaluate(library: Library, rows: Terms, known: Columns) -> Float[np.ndarray, "samples rows"]:
     own = library.take(rows).over(list(known))
     return own.evaluate(np.stack(list(known.values()), axis=1))
 
 
 def _fixed_by(
-    relation: Relation,
-    hidden: str,
-    library: Library,
-    own: Bool[np.ndarray, " terms"],
-    before: Sequence[str],
+    relation: Relation, hidden: str, library: Library, own: Terms, before: Sequence[str]
 ) -> Coupling | None:
     """The coupling whose coefficient a relation fixes; None if it fixes none."""
     if len(relation.factors) != 1 or not relation.value:

@@ -191,7 +191,8 @@ def suspect_delays(
 ) -> ByState | None:
     """Delays by state, in mean steps, that make fewer or likelier terms suffice; None if none."""
     delayed = problem.measured.copy()
-    delayed[np.argmax(delayed)] = problem.driven  # without inputs the first state sets the clock
+    # Without inputs the first state sets the clock.
+    delayed[np.argmax(delayed)] = bool(problem.inputs)
     if not (delayed.any() and free_delays(around, delayed).finite):
         return None
     best = best_support(problem, free_delays(around, delayed), penalties, support)
@@ -213,7 +214,7 @@ def _significant_delays(
     problem: EstimationProblem, around: Gram, support: Support, delayed: StateMask
 ) -> ByState:
     """Delays that each pay for themselves: of as few states as possible, lags rather than leads."""
-    if not problem.driven:
+    if not problem.inputs:
         delays, _ = best_delays(around, support, delayed)
         measured = np.flatnonzero(problem.measured)
         order = measured[np.argsort(delays[measured], kind="stable")]

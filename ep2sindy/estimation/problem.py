@@ -336,11 +336,6 @@ class EstimationProblem:
         """All coefficients that may differ from zero, in SI."""
         return (free if self.C is None else self.C @ free) * self.to_SI + self.fixed_SI
 
-    @property
-    def driven(self) -> bool:
-        """True if inputs drive the states."""
-        return bool(self.inputs)
-
     def ends(
         self, states: Float[np.ndarray, "steps d"], free: np.ndarray, n_substeps: int
     ) -> Float[np.ndarray, "steps d"]:

@@ -17,6 +17,9 @@ Coefficients = tuple[Int[np.ndarray, " p"], Int[np.ndarray, " p"]]
 
 NONE = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
 
+AtSteps = Float[np.ndarray, "steps d"]
+Slopes = Float[np.ndarray, "steps d columns"]
+
 
 @dataclass(frozen=True, eq=False)
 class Flow:
@@ -26,8 +29,8 @@ class Flow:
     coefficients.
     """
 
-    ends: Float[np.ndarray, "steps d"]
-    slopes: Float[np.ndarray, "steps d columns"]
+    ends: AtSteps
+    slopes: Slopes
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,20 +45,13 @@ class Steps:
     inputs: Float[np.ndarray, "positions steps n_inputs"]
 
 
-def ends(
-    field: VectorField, states: Float[np.ndarray, "steps d"], steps: Steps
-) -> Float[np.ndarray, "steps d"]:
+def ends(field: VectorField, states: AtSteps, steps: Steps) -> AtSteps:
     """States at the end of each step, by classical Runge-Kutta substeps."""
     return _route(field)(field, states, steps, NONE, np.empty((*states.shape, 0)))
 
 
 def flow(
-    field: VectorField,
-    states: Float[np.ndarray, "steps d"],
-    steps: Steps,
-    by: Coefficients = NONE,
-    *,
-    n_more: int = 0,
+    field: VectorField, states: AtSteps, steps: Steps, by: Coefficients = NONE, *, n_more: int = 0
 ) -> Flow:
     """`ends` with its derivatives by the states, and by some of the coefficients.
 
@@ -66,12 +62,8 @@ def flow(
 
 
 def _compiled(
-    field: VectorField,
-    states: Float[np.ndarray, "steps d"],
-    steps: Steps,
-    by: Coefficients,
-    slopes: Float[np.ndarray, "steps d columns"],
-) -> Float[np.ndarray, "steps d"]:
+    field: VectorField, states: AtSteps, steps: Steps, by: Coefficients, slopes: Slopes
+) -> AtSteps:
     """Ends of the steps by the compiled kernel; derivatives go to slopes, if it has columns."""
     weights, (equation, term) = field.weights, by
     if slopes.shape[2]:
@@ -88,12 +80,8 @@ def _compiled(
 
 
 def _in_arrays(
-    field: VectorField,
-    states: Float[np.ndarray, "steps d"],
-    steps: Steps,
-    by: Coefficients,
-    slopes: Float[np.ndarray, "steps d columns"],
-) -> Float[np.ndarray, "steps d"]:
+    field: VectorField, states: AtSteps, steps: Steps, by: Coefficients, slopes: Slopes
+) -> AtSteps:
     """`_compiled` for libraries with functions, which are evaluated at all samples at once.
 
     The tangents T of a state follow T' = (df/dx) T, and those by a coefficient gain its term.
@@ -121,5 +109,5 @@ def _in_arrays(
     return states
 
 
-def _route(field: VectorField) -> Callable[..., Float[np.ndarray, "steps d"]]:
+def _route(field: VectorField) -> Callable[..., AtSteps]:
     return _in_arrays if field.library.functions else _compiled

@@ -234,13 +234,9 @@ def _search(
     return support, least_squares(theta[:, support], values), left_out
 
 
-def _rms(errors: np.ndarray) -> float:
-    return float(np.sqrt(np.square(errors).mean()))
-
-
 def _relative(errors: np.ndarray, values: np.ndarray) -> float:
     mean = abs(float(values.mean()))
-    return _rms(errors) / mean if mean else float("nan")
+    return float(np.sqrt(np.square(errors).mean())) / mean if mean else float("nan")
 
 
 def lines_of(

@@ -23,6 +23,9 @@ ALIKE = 1e-3
 MAX_PARTS = 3
 MAX_SHOWN = 5  # of the terms of a longer combination, in its message
 
+Gram = Float[np.ndarray, "terms terms"]
+Theta = Callable[[], Float[np.ndarray, "rows terms"]]  # makes the columns of the terms
+
 # With fewer rows per term of the library than this, a search would fit the noise of its rows...
 FEW = 3
 
@@ -79,7 +82,7 @@ def order_by_degree(library: Library) -> Int[np.ndarray, " terms"]:
     return np.argsort(library.degrees, kind="stable")
 
 
-def _distinct(library: Library, xx: Float[np.ndarray, "terms terms"]) -> Bool[np.ndarray, " terms"]:
+def _distinct(library: Library, xx: Gram) -> Bool[np.ndarray, " terms"]:
     """Terms that are not zero and do not repeat a simpler one."""
     order = order_by_degree(library)
     distinct = np.diag(xx) > 0.0
@@ -94,11 +97,7 @@ def ambiguities(problem: RegressionRows) -> tuple[Ambiguity, ...]:
     return find_ambiguities(problem.library, lambda: problem.train_theta, problem.train_gram.xx)
 
 
-def find_ambiguities(
-    library: Library,
-    theta: Callable[[], Float[np.ndarray, "rows terms"]],
-    xx: Float[np.ndarray, "terms terms"],
-) -> tuple[Ambiguity, ...]:
+def find_ambiguities(library: Library, theta: Theta, xx: Gram) -> tuple[Ambiguity, ...]:
     """All ambiguities between terms of a library.
 
     theta: returns the columns of the library's terms, of unit norm or zero; it is called only where
@@ -107,7 +106,7 @@ def find_ambiguities(
     return (*_zero(library, xx), *_alike(library, xx), *_dependent(library, theta, xx))
 
 
-def _zero(library: Library, xx: Float[np.ndarray, "terms terms"]) -> list[Ambiguity]:
+def _zero(library: Library, xx: Gram) -> list[Ambiguity]:
     return [
         Ambiguity((name,), f"{name!r} is zero on every row and is left out", True)
         for name, square in zip(library.names, np.diag(xx), strict=True)
@@ -115,7 +114,7 @@ def _zero(library: Library, xx: Float[np.ndarray, "terms terms"]) -> list[Ambigu
     ]
 
 
-def _alike(library: Library, xx: Float[np.ndarray, "terms terms"]) -> list[Ambiguity]:
+def _alike(library: Library, xx: Gram) -> list[Ambiguity]:
     """Pairs of proportional terms, the simpler one first; a term left out is reported once."""
     names, order = library.names, order_by_degree(library)
     kept = _distinct(library, xx)
@@ -137,11 +136,7 @@ def _alike(library: Library, xx: Float[np.ndarray, "terms terms"]) -> list[Ambig
     return found
 
 
-def _dependent(
-    library: Library,
-    theta: Callable[[], Float[np.ndarray, "rows terms"]],
-    xx: Float[np.ndarray, "terms terms"],
-) -> list[Ambiguity]:
+def _dependent(library: Library, theta: Theta, xx: Gram) -> list[Ambiguity]:
     """Terms that are linear combinations of simpler ones, with the terms they consist of."""
     names = library.names
     found = []
@@ -159,11 +154,7 @@ def _dependent(
     return found
 
 
-def _combinations(
-    library: Library,
-    theta: Callable[[], Float[np.ndarray, "rows terms"]],
-    xx: Float[np.ndarray, "terms terms"],
-) -> list[tuple[int, list[int]]]:
+def _combinations(library: Library, theta: Theta, xx: Gram) -> list[tuple[int, list[int]]]:
     """Distinct terms that depend on simpler ones, each with the indices of those terms."""
     order = order_by_degree(library)
     columns = order[_distinct(library, xx)[order]]

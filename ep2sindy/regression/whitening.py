@@ -40,6 +40,11 @@ SETTLED = 1e-8
 # least there, so chi-squared changes by its square.
 NEGLIGIBLE = 1e-3
 
+Coef = Float[np.ndarray, " terms"]
+KeptCoef = Float[np.ndarray, " kept"]
+BySample = Float[np.ndarray, "variables samples"]
+Band = Float[np.ndarray, "band rows"]
+
 
 @dataclass(frozen=True, eq=False)
 class WhitenedRows:
@@ -59,7 +64,7 @@ class WhitenedRows:
 def whiten_rows(
     problem: RegressionRows,
     terms: Bool[np.ndarray, " terms"],
-    coef: Float[np.ndarray, " terms"],
+    coef: Coef,
     *,
     n_steps: int = 2,
     negligible: float = 0.0,
@@ -102,21 +107,14 @@ def whiten_rows(
     )
 
 
-def _is_near(
-    before: Float[np.ndarray, " terms"], after: Float[np.ndarray, " terms"], fraction: float
-) -> bool:
+def _is_near(before: Coef, after: Coef, fraction: float) -> bool:
     """Whether coefficients differ by less than a fraction of the latter; never for 0."""
     change = after - before
     return bool(change @ change < fraction**2 * (after @ after))
 
 
 def _step(
-    problem: RegressionRows,
-    sums: _Sums,
-    rows: _Linearised,
-    coef: Float[np.ndarray, " kept"],
-    *,
-    limit: float,
+    problem: RegressionRows, sums: _Sums, rows: _Linearised, coef: KeptCoef, *, limit: float
 ) -> _Linearised | None:
     """One Gauss-Newton step to coefficients, halved until the cost decreases; None if never.
 
@@ -162,11 +160,8 @@ class _Sums(NamedTuple):
         return _Sums(kept, products, products.table[used], parts)
 
     def linearise(
-        self,
-        x: Float[np.ndarray, "variables samples"],
-        perturbation: Float[np.ndarray, "variables samples"],
-        coef: Float[np.ndarray, " kept"],
-    ) -> tuple[Float[np.ndarray, "two kept samples"], Float[np.ndarray, "variables samples"]]:
+        self, x: BySample, perturbation: BySample, coef: KeptCoef
+    ) -> tuple[Float[np.ndarray, "two kept samples"], BySample]:
         """Terms at x, terms moved along their derivatives, and slopes of the model.
 
         The slopes are those of the sum of coef times term, by each variable.
@@ -193,24 +188,19 @@ class _Linearised:
     sensitivity: (variables, samples), change of the model's rate per unit noise of each variable.
     """
 
-    x: Float[np.ndarray, "variables samples"]
-    coef: Float[np.ndarray, " kept"]
+    x: BySample
+    coef: KeptCoef
     theta: Float[np.ndarray, "rows kept"]
     drifted: Float[np.ndarray, "rows kept"]
     target: Float[np.ndarray, " rows"]
-    sensitivity: Float[np.ndarray, "variables samples"]
-    factor: Float[np.ndarray, "band rows"]
+    sensitivity: BySample
+    factor: Band
     target_scale: float
     source: NoisyRows
 
     @staticmethod
     def at(
-        problem: RegressionRows,
-        sums: _Sums,
-        x: Float[np.ndarray, "variables samples"],
-        coef: Float[np.ndarray, " kept"],
-        *,
-        noisy: bool = True,
+        problem: RegressionRows, sums: _Sums, x: BySample, coef: KeptCoef, *, noisy: bool = True
     ) -> _Linearised:
         """Linearise and whiten the rows about samples x and coefficients.
 
@@ -242,7 +232,7 @@ class _Linearised:
         residual = self.target - self.drifted @ self.coef
         return float(residual @ residual + 2.0 * np.log(self.factor[0]).sum())
 
-    def fit(self, terms: Bool[np.ndarray, " terms"]) -> Float[np.ndarray, " terms"]:
+    def fit(self, terms: Bool[np.ndarray, " terms"]) -> Coef:
         """Coefficients of the chosen terms; the terms at x are instruments for the noisy terms."""
         coef = np.zeros(len(terms))
         theta, drifted = self.theta[:, terms], self.drifted[:, terms]
@@ -254,7 +244,7 @@ class _Linearised:
         )
         return coef
 
-    def correct(self, coef: Float[np.ndarray, " terms"]) -> Float[np.ndarray, "variables samples"]:
+    def correct(self, coef: Coef) -> BySample:
         """Samples minus their most likely noise."""
         weighted = _solve(self.factor, self.drifted @ coef - self.target, transposed=True)
         rows = self.source
@@ -292,9 +282,7 @@ def _lift(
     return lift
 
 
-def _covariance(
-    rows: NoisyRows, sensitivity: Float[np.ndarray, "variables samples"], target_scale: float
-) -> Float[np.ndarray, "band rows"]:
+def _covariance(rows: NoisyRows, sensitivity: BySample, target_scale: float) -> Band:
     """Covariance of the rows by the samples' noise, from its diagonal downwards."""
     windows = rows.windows
     own, std = sensitivity[rows.state], rows.columns[2][rows.state] / target_scale
@@ -306,7 +294,7 @@ def _covariance(
     return band.T
 
 
-def _banded_cholesky(band: Float[np.ndarray, "band rows"]) -> Float[np.ndarray, "band rows"]:
+def _banded_cholesky(band: Band) -> Band:
     """Lower Cholesky factor of the covariance, banded since distant windows do not overlap."""
     band[0] += RIDGE * band[0].mean() + ROUNDING**2 / len(band[0])
     factor, info = dpbtrf(band, lower=True, overwrite_ab=True)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ep2sindy.data.coerce import DiscoveryProblem, noise_inside
+from ep2sindy.data.coerce import DiscoveryProblem
 from ep2sindy.data.numbers import column_norms
 from ep2sindy.library.relations import Place, Process
 from ep2sindy.library.roles import Roles, constraint_of, process_matrix
@@ -53,7 +53,8 @@ def search_conserving_systems(
     unit = columns / norms
     masks = search.supports(unit.T @ unit, unit.T @ target, float(target @ target))
     whole = _rank_supports(_keep_complete(masks, processes, roles.names), unit, target)
-    means = _average_terms(task, processes) if roles.forward else None
+    terms = [task.library.index(process.term) for process in processes]
+    means = task.theta.mean(axis=0)[terms] if roles.forward else None
 
     def build(support: Support) -> tuple[list[Process], np.ndarray, np.ndarray | None]:
         """Processes of a support, their coefficients, and the means of their terms."""
@@ -146,16 +147,6 @@ def _build_system(
     known = roles.known
     fixed = np.array([known.get(held.coefficients[k], 0.0) for k in held.free])
     return TrialSystem.of(task, held, process_matrix(held) @ values + fixed, means)
-
-
-def _average_terms(
-    task: DiscoveryProblem, processes: Sequence[Process]
-) -> Float[np.ndarray, " processes"]:
-    """Mean of the term of every process over the records."""
-    library = task.library
-    values = [noise_inside(library, run.columns(library.variables)) for run in task.runs]
-    mean = library.evaluate(np.concatenate(values)).mean(axis=0)
-    return mean[[library.index(process.term) for process in processes]]
 
 
 def _add_fronts(

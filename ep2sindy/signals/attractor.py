@@ -12,6 +12,10 @@ from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.runtime.values import read_only
 from ep2sindy.signals.spectrum import (
+    Bins,
+    ByState,
+    Samples,
+    States,
     is_uniform,
     noise_floor,
     peak,
@@ -56,13 +60,13 @@ class Cycle:
     """
 
     frequency_Hz: float
-    phase: Float[np.ndarray, " samples"]
-    mean: Float[np.ndarray, " n_states"]
+    phase: Samples
+    mean: ByState
     harmonics: Complex[np.ndarray, "n_harmonics n_states"]
     fraction: float
 
     @property
-    def std(self) -> Float[np.ndarray, " n_states"]:
+    def std(self) -> ByState:
         """Standard deviation of the waveform of each state, so without noise."""
         return np.sqrt(0.5 * np.square(np.abs(self.harmonics)).sum(axis=0))
 
@@ -81,12 +85,7 @@ class Cycle:
         return self.mean + (np.exp(1j * np.outer(phase, order)) @ self.harmonics).real
 
 
-def find_cycle(
-    t: Float[np.ndarray, " samples"],
-    states: Float[np.ndarray, "samples n_states"],
-    *,
-    n_harmonics: int | None = None,
-) -> Cycle | None:
+def find_cycle(t: Samples, states: States, *, n_harmonics: int | None = None) -> Cycle | None:
     """Period and waveform of a record; None if the record is not periodic.
 
     The period is that of the state whose spectrum has the sharpest line. The phase of this state is
@@ -180,9 +179,7 @@ def _find_line(frequency: np.ndarray, power: np.ndarray) -> tuple[float, float]:
     return rough_Hz, float(power[near].sum() / power.sum())
 
 
-def white_variance(
-    frequency: Float[np.ndarray, " bins"], power: Float[np.ndarray, " bins"]
-) -> float:
+def white_variance(frequency: Bins, power: Bins) -> float:
     """Variance of the white noise in a signal, from the upper half of its spectrum."""
     return float(noise_floor(power) * frequency[-1]) if len(power) else 0.0
 
@@ -225,11 +222,7 @@ def mean_cycle(run: Trajectory) -> Trajectory:
     return replace(run, states=cycle.waveform(cycle.phase))
 
 
-def follow_phase(
-    t: Float[np.ndarray, " samples"],
-    x: Float[np.ndarray, " samples"],
-    straight: Float[np.ndarray, " samples"],
-) -> Float[np.ndarray, " samples"]:
+def follow_phase(t: Samples, x: Samples, straight: Samples) -> Samples:
     """Unwrapped phase in rad, at every sample, of the component of x near a phase linear in time.
 
     x is demodulated and averaged under a Hann window of eight periods, or of half the record if
@@ -370,7 +363,7 @@ def best_shift(data: Cycle, other: Cycle) -> float:
     return best
 
 
-def waveform_errors(data: Cycle, other: Cycle) -> Float[np.ndarray, " n_states"]:
+def waveform_errors(data: Cycle, other: Cycle) -> ByState:
     """RMS difference of two waveforms at the best shift, in standard deviations of the data.
 
     All states share one shift, so a wrong lag between states counts as an error.

@@ -22,6 +22,7 @@ from ep2sindy.library.units import Clock, seconds_in
 from ep2sindy.runtime.values import check_positive
 from ep2sindy.signals.attractor import Cycle, find_cycle
 from ep2sindy.signals.signal import Signal
+from ep2sindy.signals.spectrum import Samples
 
 DRIVE = ("cos_drive", "sin_drive")  # inputs that stand for a drive of known period
 
@@ -272,11 +273,7 @@ def _gain(signal: Signal, t: np.ndarray, u: np.ndarray) -> float:
     return 1.0 - left[1] / left[0] if left[0] > 0.0 else 0.0
 
 
-def describe_set(
-    t: Float[np.ndarray, " samples"],
-    u: Float[np.ndarray, " samples"],
-    others: Sequence[Float[np.ndarray, " samples"]],
-) -> str:
+def describe_set(t: Samples, u: Samples, others: Sequence[Samples]) -> str:
     """How a column looks as if somebody sets it: held, a sweep or a sine; empty if it does not.
 
     Held: it rests over most steps, and leaps. A sweep: periodic, and as long at any value as at any
@@ -304,9 +301,7 @@ def describe_set(
     return SINE if impure[0] < PURE and leads and (PURER * impure[0] < impure[1:]).all() else ""
 
 
-def propose_inputs(
-    t: Float[np.ndarray, " samples"], columns: Mapping[str, Float[np.ndarray, " samples"]]
-) -> dict[str, str]:
+def propose_inputs(t: Samples, columns: Mapping[str, Samples]) -> dict[str, str]:
     """Columns of a file that look set, name -> how; none if no other column is left."""
     looks = [name for name, u in columns.items() if describe_set(t, u, [])]
     others = [u for name, u in columns.items() if name not in looks]

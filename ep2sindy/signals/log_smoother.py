@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from jaxtyping import Float
 from scipy.interpolate import make_interp_spline
 
 from ep2sindy.data.numbers import least_beside_grid
 from ep2sindy.runtime.values import read_only
 from ep2sindy.signals.smoothers import WienerProcess, check_memory_bounds, ratio_bounds, scale_steps
+from ep2sindy.signals.spectrum import Samples
 
 # Range of log10 of the ratio of process to measurement noise, with the mean step as the unit of
 # time and the mean as the unit of the signal: from a memory of about 30 samples to interpolation.
@@ -37,8 +37,8 @@ class LogEstimate:
     log10_ratio: log10 of the ratio of process to measurement noise.
     """
 
-    log: Float[np.ndarray, " samples"]
-    rate: Float[np.ndarray, " samples"]
+    log: Samples
+    rate: Samples
     noise_std: float
     log10_ratio: float
 
@@ -47,7 +47,7 @@ class LogEstimate:
         object.__setattr__(self, "rate", read_only(self.rate))
 
     @property
-    def smoothed(self) -> Float[np.ndarray, " samples"]:
+    def smoothed(self) -> Samples:
         return np.exp(self.log)
 
 
@@ -99,9 +99,7 @@ class LogSmoother:
     def __post_init__(self) -> None:
         check_memory_bounds(self.finest_s, self.coarsest_s)
 
-    def estimate(
-        self, t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samples"]
-    ) -> LogEstimate:
+    def estimate(self, t: Samples, x: Samples) -> LogEstimate:
         """Smooth samples of a signal that is positive apart from noise; steps may be unequal.
 
         Parameters

@@ -20,7 +20,7 @@ from scipy.linalg.lapack import dgbtrf, dgbtrs, dpbtrf, dtbtrs
 from ep2sindy.data.numbers import least_beside_grid, zero_to_one
 from ep2sindy.data.trajectory import check_time
 from ep2sindy.runtime.values import check_positive, read_only
-from ep2sindy.signals.spectrum import is_uniform
+from ep2sindy.signals.spectrum import Samples, is_uniform
 
 # The range extends from a memory of about 200 samples to interpolation.
 LOG10_RATIO_MIN, LOG10_RATIO_MAX = -14.0, 4.0
@@ -46,23 +46,19 @@ WIDTH = 5  # of the band on either side of the diagonal
 
 BLOCK = 262_144  # samples that are differentiated at once
 
+Columns = Float[np.ndarray, "samples columns"]
+
 
 @runtime_checkable
 class Smoother(Protocol):
     """Interface of the smoothers: smoothed samples, and their time derivative."""
 
-    def smooth(
-        self, t: Float[np.ndarray, " samples"], values: Float[np.ndarray, "samples columns"]
-    ) -> Float[np.ndarray, "samples columns"]: ...
+    def smooth(self, t: Samples, values: Columns) -> Columns: ...
 
-    def derivative(
-        self, t: Float[np.ndarray, " samples"], values: Float[np.ndarray, "samples columns"]
-    ) -> Float[np.ndarray, "samples columns"]: ...
+    def derivative(self, t: Samples, values: Columns) -> Columns: ...
 
 
-def difference(
-    t: Float[np.ndarray, " samples"], values: Float[np.ndarray, "samples columns"]
-) -> Float[np.ndarray, "samples columns"]:
+def difference(t: Samples, values: Columns) -> Columns:
     """Second-order finite differences, exact for parabolas, also at unequal steps and the ends."""
     if len(t) < 3:
         raise ValueError(f"second-order differences need three samples or more, got {len(t)}")
@@ -79,14 +75,10 @@ def difference(
 class NoSmoothing:
     """Use the samples unchanged, for data without noise."""
 
-    def smooth(
-        self, t: Float[np.ndarray, " samples"], values: Float[np.ndarray, "samples columns"]
-    ) -> Float[np.ndarray, "samples columns"]:
+    def smooth(self, t: Samples, values: Columns) -> Columns:
         return values
 
-    def derivative(
-        self, t: Float[np.ndarray, " samples"], values: Float[np.ndarray, "samples columns"]
-    ) -> Float[np.ndarray, "samples columns"]:
+    def derivative(self, t: Samples, values: Columns) -> Columns:
         return difference(t, values)
 
 
@@ -129,9 +121,7 @@ class SavitzkyGolay:
                 f"window={self.window}, order={self.order}"
             )
 
-    def smooth(
-        self, t: Float[np.ndarray, " samples"], values: Float[np.ndarray, "samples columns"]
-    ) -> Float[np.ndarray, "samples columns"]:
+    def smooth(self, t: Samples, values: Columns) -> Columns:
         """Raises ValueError when the trajectory is shorter than the window."""
         if len(t) < self.window:
             raise ValueError(
@@ -142,9 +132,7 @@ class SavitzkyGolay:
             return self._smooth_equal(values)
         return self._smooth_unequal(t, values)
 
-    def derivative(
-        self, t: Float[np.ndarray, " samples"], values: Float[np.ndarray, "samples columns"]
-    ) -> Float[np.ndarray, "samples columns"]:
+    def derivative(self, t: Samples, values: Columns) -> Columns:
         return difference(t, self.smooth(t, values))
 
     def _smooth_equal(self, values: np.ndarray) -> np.ndarray:
@@ -215,7 +203,7 @@ class WienerProcess:
         return WienerProcess(steps, weights, by_noise, by_process)
 
     def likelihood(
-        self, values: Float[np.ndarray, "samples columns"], ratio: float
+        self, values: Columns, ratio: float
     ) -> tuple[Float[np.ndarray, " columns"], Float[np.ndarray, " columns"]]:
         """Log-likelihood of each column's third differences, and the variance of its noise.
 
@@ -234,20 +222,16 @@ class WienerProcess:
         noise = np.maximum(squares / n, ROUNDING)
         return -0.5 * (n * np.log(noise) + logs), noise
 
-    def signal(
-        self, values: Float[np.ndarray, "samples columns"], ratio: float
-    ) -> Float[np.ndarray, "samples columns"]:
+    def signal(self, values: Columns, ratio: float) -> Columns:
         """The signal given all samples: the quintic smoothing spline."""
         return values - self.solve(values, ratio)[0]
 
-    def roughness(self, signal: Float[np.ndarray, " samples"]) -> float:
+    def roughness(self, signal: Samples) -> float:
         """Squares of a signal's third differences over their variances, for a lumped Q."""
         third = self._differences_of(signal[:, None])[:, 0]
         return float((np.square(third) / self.by_process[0]).sum())
 
-    def slope(
-        self, signal: Float[np.ndarray, "samples columns"]
-    ) -> Float[np.ndarray, "samples columns"]:
+    def slope(self, signal: Columns) -> Columns:
         """Slope of a signal given all samples, whose third and fourth derivative end at zero."""
         nothing, t = np.zeros(signal.shape[1]), np.append(0.0, np.cumsum(self.steps))
         ends = [(3, nothing), (4, nothing)]
@@ -255,12 +239,12 @@ class WienerProcess:
 
     def solve(
         self,
-        values: Float[np.ndarray, "samples columns"],
+        values: Columns,
         ratio: float,
         *,
-        weights: Float[np.ndarray, " samples"] | float = 1.0,
-        pull: Float[np.ndarray, "samples columns"] | float = 0.0,
-    ) -> tuple[Float[np.ndarray, "samples columns"], Float[np.ndarray, " columns"], float]:
+        weights: Samples | float = 1.0,
+        pull: Columns | float = 0.0,
+    ) -> tuple[Columns, Float[np.ndarray, " columns"], float]:
         """Noise of the samples, sum of weighted squares, and log-determinant of D D' + ratio Q.
 
         weights: W of the squares of the noise. pull: p in W e - D' c = -p, half the gradient that
@@ -287,9 +271,7 @@ class WienerProcess:
         logs = np.log(np.abs(factor[2 * WIDTH])).sum() + n * np.log(ratio)
         return solution[:, 0], squares, float(logs)
 
-    def _differences_of(
-        self, values: Float[np.ndarray, "samples columns"]
-    ) -> Float[np.ndarray, "differences columns"]:
+    def _differences_of(self, values: Columns) -> Float[np.ndarray, "differences columns"]:
         n = self.differences.shape[1]
         pairs = enumerate(self.differences)
         return sum(weight[:, None] * values[k : k + n] for k, weight in pairs)
@@ -305,8 +287,8 @@ class KalmanEstimate:
     unit of time.
     """
 
-    smoothed: Float[np.ndarray, "samples columns"]
-    derivative: Float[np.ndarray, "samples columns"]
+    smoothed: Columns
+    derivative: Columns
     noise_std: Float[np.ndarray, " columns"]
     log10_ratio: Float[np.ndarray, " columns"]
 
@@ -371,9 +353,7 @@ class KalmanSmoother:
             )
         check_memory_bounds(self.finest_s, self.coarsest_s)
 
-    def estimate(
-        self, t: Float[np.ndarray, " samples"], values: Float[np.ndarray, "samples columns"]
-    ) -> KalmanEstimate:
+    def estimate(self, t: Samples, values: Columns) -> KalmanEstimate:
         """Smooth every column and estimate its derivative and noise.
 
         `smooth` and `derivative` return parts of this result, each at the full cost.
@@ -417,15 +397,11 @@ class KalmanSmoother:
             log10_ratio=ratios,
         )
 
-    def smooth(
-        self, t: Float[np.ndarray, " samples"], values: Float[np.ndarray, "samples columns"]
-    ) -> Float[np.ndarray, "samples columns"]:
+    def smooth(self, t: Samples, values: Columns) -> Columns:
         """Raises ValueError for fewer than five samples."""
         return self.estimate(t, values).smoothed
 
-    def derivative(
-        self, t: Float[np.ndarray, " samples"], values: Float[np.ndarray, "samples columns"]
-    ) -> Float[np.ndarray, "samples columns"]:
+    def derivative(self, t: Samples, values: Columns) -> Columns:
         """Raises ValueError for fewer than five samples."""
         return self.estimate(t, values).derivative
 
@@ -447,7 +423,7 @@ def ratio_bounds(
 
 def most_likely_ratios(
     process: WienerProcess,
-    columns: Float[np.ndarray, "samples columns"],
+    columns: Columns,
     lowest: float = LOG10_RATIO_MIN,
     highest: float = LOG10_RATIO_MAX,
 ) -> Float[np.ndarray, " columns"]:
@@ -473,7 +449,7 @@ def check_memory_bounds(finest_s: float | None, coarsest_s: float | None) -> Non
 
 
 def scale_steps(
-    t: Float[np.ndarray, " samples"], values: Float[np.ndarray, "samples ..."], least: int
+    t: Samples, values: Float[np.ndarray, "samples ..."], least: int
 ) -> tuple[Float[np.ndarray, " steps"], float]:
     """Time steps in units of their mean, and that mean in s.
 

@@ -24,16 +24,19 @@ PEAK_WIDTH = 0.05  # half-width of a peak, as a fraction of its frequency; two b
 
 DECAYED = 0.1  # a run has decayed if its late spread is below this fraction of the data's
 
+Samples = Float[np.ndarray, " samples"]
+States = Float[np.ndarray, "samples n_states"]
+ByState = Float[np.ndarray, " n_states"]
+Bins = Float[np.ndarray, " bins"]
 
-def is_uniform(t: Float[np.ndarray, " samples"]) -> bool:
+
+def is_uniform(t: Samples) -> bool:
     """Return true if all time steps agree to the rounding of the recorded times."""
     steps = np.diff(t)
     return bool(np.ptp(steps) <= max(STEP_TOLERANCE * steps.mean(), 2 * rounding_s(t)))
 
 
-def resample_evenly(
-    t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samples"]
-) -> Float[np.ndarray, " samples"]:
+def resample_evenly(t: Samples, x: Samples) -> Samples:
     """Samples at equal steps, the mean of the given ones, by cubic splines between gaps.
 
     A gap is bridged by a straight line: a spline would overshoot there.
@@ -50,9 +53,7 @@ def resample_evenly(
     return values
 
 
-def power_spectrum(
-    t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samples"]
-) -> tuple[Float[np.ndarray, " bins"], Float[np.ndarray, " bins"]]:
+def power_spectrum(t: Samples, x: Samples) -> tuple[Bins, Bins]:
     """One-sided power spectral density of x, with the mean removed and a Hann window.
 
     t: (samples,) in s. Samples at unequal steps are first resampled at the mean step: by cubic
@@ -72,7 +73,7 @@ def power_spectrum(
     return fft.rfftfreq(len(x), 1.0 / rate_Hz), power
 
 
-def dominant_frequency(t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samples"]) -> float:
+def dominant_frequency(t: Samples, x: Samples) -> float:
     """Frequency in Hz of the highest spectral peak, refined between bins.
 
     A parabola is fitted to the log power of the peak bin and its neighbours. For a Hann window
@@ -95,7 +96,7 @@ def samples_in_periods(
     return round(steps_in(periods, frequency_Hz=frequency_Hz, dt_s=dt_s)) + 1
 
 
-def peak(frequency: Float[np.ndarray, " bins"], power: Float[np.ndarray, " bins"]) -> float:
+def peak(frequency: Bins, power: Bins) -> float:
     """Frequency in Hz of the highest peak of a power spectrum; see `dominant_frequency`."""
     if len(power) < 4 or power.max() <= 0.0:
         return 0.0
@@ -106,7 +107,7 @@ def peak(frequency: Float[np.ndarray, " bins"], power: Float[np.ndarray, " bins"
     return float(frequency[k] + np.clip(shift, -0.5, 0.5) * frequency[1])
 
 
-def noise_floor(power: Float[np.ndarray, " bins"]) -> float:
+def noise_floor(power: Bins) -> float:
     """Power density of white noise, from the upper half of a spectrum.
 
     It is the median there, which spectral lines of a signal hardly change.
@@ -115,7 +116,7 @@ def noise_floor(power: Float[np.ndarray, " bins"]) -> float:
     return float(np.median(upper) / np.log(2.0)) if upper.size else 0.0
 
 
-def _above_noise(power: Float[np.ndarray, " bins"]) -> Float[np.ndarray, " bins"]:
+def _above_noise(power: Bins) -> Bins:
     """Power density that stands out of the noise floor; zero where none does."""
     floor = noise_floor(power)
     # The largest of n exponential variables exceeds log n + 3 once in twenty records.
@@ -123,7 +124,7 @@ def _above_noise(power: Float[np.ndarray, " bins"]) -> Float[np.ndarray, " bins"
     return np.where(stands_out, power - floor, 0.0)
 
 
-def crossing_frequency(t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samples"]) -> float:
+def crossing_frequency(t: Samples, x: Samples) -> float:
     """Mean rate in Hz at which a signal rises through its mean, white noise left out.
 
     The frequency of a signal without a period, by the second moment of its spectrum. Zero for a
@@ -136,9 +137,7 @@ def crossing_frequency(t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " 
     return float(np.sqrt((np.square(frequency) * excess).sum() / whole)) if whole else 0.0
 
 
-def lost_in_means(
-    t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samples"], *, width_s: float
-) -> float:
+def lost_in_means(t: Samples, x: Samples, *, width_s: float) -> float:
     """Fraction of a signal's power above the noise that means over a width in s take from it."""
     frequency, power = power_spectrum(t, x)
     excess = _above_noise(power)
@@ -151,7 +150,7 @@ def lost_in_means(
 KEPT = 0.99
 
 
-def signal_memory_s(t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samples"]) -> float:
+def signal_memory_s(t: Samples, x: Samples) -> float:
     """Longest memory, in s, of a twice integrated Wiener process that still follows the signal.
 
     A smoother of memory tau passes the fraction 1 / (1 + (2 pi f tau)^6) of a component of
@@ -222,11 +221,7 @@ RECORDED = OscillationBounds(spread=0.01, lasting=0.5, min_periods=4.0, min_peak
 SIMULATED = OscillationBounds(spread=0.02, lasting=0.7, n_blocks=4)
 
 
-def oscillation(
-    t: Float[np.ndarray, " samples"],
-    states: Float[np.ndarray, "samples n_states"],
-    bounds: OscillationBounds = RECORDED,
-) -> Oscillation:
+def oscillation(t: Samples, states: States, bounds: OscillationBounds = RECORDED) -> Oscillation:
     """Classify a record by the first bound that it violates; `oscillating` if it violates none."""
     blocks = np.array_split(states, bounds.n_blocks)
     if (relative_spread(blocks[-1]) < bounds.spread).any():
@@ -244,25 +239,19 @@ def oscillation(
     return Oscillation.TRANSIT if peak_Hz > bounds.max_Hz else Oscillation.OSCILLATING
 
 
-def relative_spread(
-    states: Float[np.ndarray, "samples n_states"],
-) -> Float[np.ndarray, " n_states"]:
+def relative_spread(states: States) -> ByState:
     """Standard deviation of every state divided by the absolute value of its mean."""
     return states.std(axis=0) / np.maximum(np.abs(states.mean(axis=0)), np.finfo(float).tiny)
 
 
 def has_decayed(
-    states: Float[np.ndarray, "samples n_states"],
-    earlier: Float[np.ndarray, "_ n_states"],
-    fraction: float,
+    states: States, earlier: Float[np.ndarray, "_ n_states"], fraction: float
 ) -> Bool[np.ndarray, " n_states"]:
     """True for each state whose standard deviation is below `fraction` times that of `earlier`."""
     below: np.ndarray = states.std(axis=0) < fraction * earlier.std(axis=0)
     return below
 
 
-def relative_amplitude(
-    mean: Float[np.ndarray, " n_states"], std: Float[np.ndarray, " n_states"]
-) -> float:
+def relative_amplitude(mean: ByState, std: ByState) -> float:
     """Root mean square over the states of standard deviation divided by absolute mean."""
     return float(np.sqrt(np.square(std / zero_to_one(np.abs(mean))).mean()))
