@@ -28,6 +28,7 @@ from ep2sindy.forecasting.state_estimation import (
     BandWidths,
     FittedState,
     StateEstimator,
+    measured_states,
     tune_estimator,
 )
 from ep2sindy.library.units import SECONDS, Clock
@@ -221,7 +222,8 @@ def forecast(
     past = trajectory_of(history)
     times = _times(past.t, past.dt_s, horizon)
     known = past if fitted_to is None else trajectory_of(fitted_to)
-    for follow in (False, True):
+    is_guessed = len(measured_states(model, known)) < len(model.states)
+    for follow in (False, True) if is_guessed else (False,):
         tuned = tune_estimator(model, known, measured=measured, follow=follow)
         estimator = calibrate(tuned, known, seed=seed)
         (ahead,) = draw_forecasts(

@@ -1,4 +1,4 @@
-"""Workers on the machines of a cluster, by backends of joblib."""
+"""Workers on the machines of a cluster: of dask, and of Ray by its backend of joblib."""
 
 from __future__ import annotations
 

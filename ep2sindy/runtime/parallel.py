@@ -1,6 +1,6 @@
 """Execution of independent pieces of work: one after the other, on all cores, or by joblib.
 
-Clusters (`clusters.py`) are backends of joblib, too: they differ in what they connect to.
+Clusters are in `clusters.py`, and what keeps finished pieces in `kept_pieces.py`.
 """
 
 from __future__ import annotations

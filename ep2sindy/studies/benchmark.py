@@ -314,13 +314,18 @@ def add_frontier(report: Report, outcomes: pd.DataFrame) -> None:
     points = points[["variant", "rate_Hz", "duration_s", "n_samples", "identified", "reason"]]
     few = points[points["reason"] != ""].groupby("variant", sort=False).size()
     counts = ", ".join(f"{variant} {n}" for variant, n in few.items())
-    report.add(f"Too few samples to run: {counts or 'none'}; tables/points.csv says why.")
+    systems = ", ".join(outcomes["system"].unique())
+    few_words = f"Too few samples to run: {counts or 'none'}; tables/points.csv says why."
+    report.add(f"{systems}, at {len(points) // points['variant'].nunique()} points. {few_words}")
     report.figure("frontier", partial(frontier_figure, points), CAPTIONS["frontier"])
     report.table("points", points, shown=False)
-    conclude(report, points.assign(n=1), picture="frontier", table="points")
+    of = f"sampling rates and durations of {systems}"
+    conclude(report, points.assign(n=1), of, picture="frontier", table="points")
 
 
-def conclude(report: Report, counted: pd.DataFrame, *, picture: str, table: str) -> None:
+def conclude(
+    report: Report, counted: pd.DataFrame, of: str = "realizations", *, picture: str, table: str
+) -> None:
     """Say which variant is right most often; a variant that selects nothing has 0 % selected."""
     there = [merit for merit in SELECTED if merit in counted]
     for name, rows in counted.groupby("variant", sort=False):
@@ -333,7 +338,7 @@ def conclude(report: Report, counted: pd.DataFrame, *, picture: str, table: str)
     best = str(percent.idxmax())
     title = f"{best}, {SELECTED[merit]} in {percent[best]:.0f} % of {int(known['n'][best])}"
     fractions = "; ".join(f"{name} {value:.0f} %" for name, value in percent.items())
-    _found(report, f"{title} realizations", f"{SELECTED[merit]}: {fractions}", picture, table)
+    _found(report, f"{title} {of}", f"{SELECTED[merit]}: {fractions}", picture, table)
 
 
 def add_errors(report: Report, outcomes: pd.DataFrame, forms: Ways) -> None:
