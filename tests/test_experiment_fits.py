@@ -163,7 +163,9 @@ def test_the_laws_own_structure_is_sustained_at_both_points(tmp_path: Path) -> N
     assert over["law_refined"]["amplitude_error"] < 1e-3
     assert over["predator_prey_refined"]["n_sustained"] == 0
     fits = found.report.tables["fits"].set_index("fit")
-    assert fits.loc["law_refined, V_D_V=0, mdot_mg_s=5", "status"] == "sustained"
+    assert fits.loc["law_refined, V_D_V=0, mdot_mg_s=5", "status"].startswith(
+        "follows the samples for"
+    )
     faster = found.summary["models"]["law_refined_1"]["equations"]["n_n"]
     assert faster["1"] == pytest.approx(1.1 * 2.31e23, rel=1e-3)
     assert faster["n_n"] == pytest.approx(1.1 * -2.76e3, rel=1e-2)

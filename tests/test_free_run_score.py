@@ -17,6 +17,7 @@ from ep2sindy.selection.systems import (
     ConfirmedSystem,
     Segment,
     Trial,
+    describe_shared,
     find_sustained,
     folds,
     list_others,
@@ -160,7 +161,7 @@ def test_runs_start_at_phases_spread_over_the_period(rounds, part, n_samples, st
 def test_the_longest_record_confirms_a_system(rounds, monkeypatch):
     runs, seen = rounds[0], []
     both = [runs.runs[0].window(0, 400), runs.runs[0]]
-    verdict = SimpleNamespace(status=ep.model.Status.WRONG_CYCLE)
+    verdict = SimpleNamespace(comparison=SimpleNamespace(stays=False))
     monkeypatch.setattr(free_run, "evaluate", lambda _, run, **__: seen.append(run) or verdict)
     tried = Trial(SimpleNamespace(broken=lambda model: []))
     for order in (both, both[::-1]):
@@ -168,11 +169,15 @@ def test_the_longest_record_confirms_a_system(rounds, monkeypatch):
     assert [run.n_samples for run in seen] == [960, 960]
 
 
-def test_a_verdict_says_how_many_starts_reach_the_cycle():
-    run = SimpleNamespace(text="sustained", status=ep.model.Status.SUSTAINED)
+def test_a_note_says_what_becomes_of_the_cycle_and_what_all_sustained_systems_share():
+    run = SimpleNamespace(run_text="sustained", comparison=SimpleNamespace(stays=True))
     tried, model = Trial(None), SimpleNamespace(inputs=())
-    expected = "sustained, 25 % of starts reach it; 2 of 9 systems are sustained where not fitted"
+    expected = "sustained, on a cycle that attracts; 2 of 9 systems are sustained where not fitted"
     assert ConfirmedSystem(tried, model, (), 0.25, run).text(2, 9) == expected
+    both = [Trial(SimpleNamespace(parts={"x'": terms})) for terms in (("x", "y"), ("y", "x*y"))]
+    assert describe_shared(both) == "; all of these have x': y"
+    assert describe_shared([trial("a"), trial("b")]) == "; these have no term in common"
+    assert describe_shared(both[:1]) == ""
 
 
 def test_noise_that_more_terms_follow_does_not_make_a_cycle_attract():
@@ -304,7 +309,7 @@ def confirmed(
 ):
     """A system as the rule has confirmed it, with these figures."""
     held = SimpleNamespace(n_free=n_free)
-    run = SimpleNamespace(rank=(not is_sustained, 0))
+    run = SimpleNamespace(comparison=SimpleNamespace(rank=(not is_sustained, 0)))
     return ConfirmedSystem(
         Trial(held, 0.3, 0.0, 0.0, waveform, loss), None, broken, fraction, run, repels
     )

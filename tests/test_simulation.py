@@ -168,10 +168,9 @@ def test_the_true_model_scores_one_and_a_constant_zero() -> None:
     t = np.linspace(0.0, 6.0, 601)
     model = linear()
     run = model.simulate(t, [1.0, -0.5]).trajectory()
-    assert model.score(run) == pytest.approx(1.0, abs=1e-6)
+    assert model.score(run) == pytest.approx(1.0, abs=1e-12)
     assert model.score(run, x_dot=run.states @ A.T) == pytest.approx(1.0, abs=1e-15)
-    # Differences are off by dt^2/6 * x''', which is below 8; R2 takes the square of that.
-    assert 1.0 - model.score(run, smoother=ep.signals.NoSmoothing()) < (0.01**2 / 6 * 8) ** 2
+    assert model.score(run, horizon_s=2.0) == pytest.approx(1.0, abs=1e-12)
     x_dot = run.states @ A.T
     library = ep.polynomial(["x", "y"], degree=1)
     still = ep.SparseModel(library, ["x", "y"], np.array([x_dot.mean(axis=0), [0, 0], [0, 0]]))

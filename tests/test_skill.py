@@ -31,24 +31,36 @@ def errors(size: float | np.ndarray, *, seed: int = 0, n: int = 40) -> np.ndarra
 
 def test_a_gain_at_all_horizons_is_reported() -> None:
     found = skill(model=errors(0.1), autoregression=errors(0.3, seed=1))
-    assert found.text == "better than an autoregression (AR 3) for 2 periods and more"
-    assert found.headline == f"a model that forecasts {found.text}"
-    assert found.better_until_periods == 2.0
+    assert found.text == "better than an autoregression up to 2 periods"
+    assert found.better_periods == (0.0, 2.0)
+    assert found.nearest_text == "Least error: the model up to 2 periods."
 
 
-def test_a_span_begins_at_the_first_horizon_and_ends_with_the_gain() -> None:
+def test_a_gain_is_reported_from_the_horizon_where_it_begins_to_where_it_ends() -> None:
     grows = np.where(np.arange(N_HORIZONS) < 20, 0.1, 0.6)
     found = skill(model=errors(grows), autoregression=errors(0.3, seed=1))
-    assert found.text == "better than an autoregression (AR 3) for 1 periods"
+    assert found.text == "better than an autoregression up to 1 periods"
     later = skill(model=errors(grows[::-1]), autoregression=errors(0.3, seed=1))
-    assert later.text == "no better than an autoregression (AR 3)"
-    assert later.headline == "nothing that forecasts better than an autoregression (AR 3)"
+    assert later.text == "better than an autoregression from 1 to 2 periods"
+    expected = "Least error: the autoregression up to 1, the model up to 2 periods."
+    assert later.nearest_text == expected
+
+
+def test_a_gain_that_chance_may_make_is_neither_praised_nor_denied() -> None:
+    """It is all in the errors of the autoregression from three starts of forty."""
+    wild = np.where(np.arange(40) < 3, 3.0, 0.2)[:, None]
+    found = skill(model=errors(0.2), autoregression=wild * errors(1.0, seed=1))
+    assert found.text == "nearer than an autoregression up to 2 periods, within chance"
 
 
 def test_errors_above_the_mean_s_are_no_forecast() -> None:
-    found = skill(model=errors(1.5), autoregression=errors(3.0, seed=1))
-    assert not found.is_better
-    assert "the mean of the record is best" in found.text
+    still = {"persistence": errors(2.0, seed=2), "autoregression": errors(3.0, seed=1)}
+    found = skill(model=errors(1.5), **still)
+    assert found.text == "no better than an autoregression"
+    assert found.veto == "the mean"
+    assert found.nearest_text == "Least error: the mean up to 2 periods."
+    assert skill(model=errors(2.5), **still).veto == "the last sample"
+    assert not skill(model=errors(0.9), **still).veto
 
 
 def test_one_start_or_equal_errors_tell_nothing() -> None:

@@ -211,4 +211,5 @@ def _discover_point(
     covariance = None if test.lack_of_fit else found.model.covariance
     model = replace(found.model, clock=task.runs[0].clock, covariance=covariance)
     note = "; ".join(filter(None, [test.note, found.note or test.lack_of_fit]))
-    return replace(found, model=model, method=method, noise_test=test, note=note)
+    records = task.runs if found.estimate is None else found.estimate.runs
+    return replace(found, model=model, method=method, noise_test=test, note=note, records=records)

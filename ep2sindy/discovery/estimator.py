@@ -138,16 +138,15 @@ class SINDy(BaseEstimator):
         return self.model_.predict(states, self._inputs(u))
 
     def score(self, X: Any, t: Any, *, u: Any = None) -> float:
-        """R2 of the derivative, averaged over states; of several trajectories by their samples.
+        """R2 of forecasts over one step, averaged over states, from samples of all trajectories.
 
-        The derivative of the samples is estimated (`SparseModel.score`): in noise, no model
-        reaches 1. X, t, u: as for `fit`.
+        An exact law of clean samples has 1, and noise keeps it below (`SparseModel.score`).
+        X, t, u: as for `fit`.
         """
         check_is_fitted(self)
         names = (*self.model_.states, *self.input_names_)
         runs = self._runs(X, t, u, names, reset=False)
-        scores = [self.model_.score(run) for run in runs]
-        return float(np.average(scores, weights=[run.n_samples for run in runs]))
+        return self.model_.score(runs)
 
     def simulate(self, x0: Any, t: Any, u: Any = None) -> Float[np.ndarray, "samples n_states"]:
         """States at the times t, in s, from x0 at t[0]; NaN from where the run has diverged.

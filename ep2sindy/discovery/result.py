@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import html
 import json
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -15,8 +17,10 @@ from numpy.typing import ArrayLike
 
 from ep2sindy._stubs import dotted_names, place_of
 from ep2sindy.data.coerce import DiscoveryProblem
-from ep2sindy.data.runs import Run
+from ep2sindy.data.runs import Run, Runs
+from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.estimation.estimate import Estimate
+from ep2sindy.forecasting.evaluation import Evaluation, evaluate
 from ep2sindy.forecasting.forecast import Forecast, forecast
 from ep2sindy.library.relations import Constraint, Process
 from ep2sindy.model.display import model_html, model_lines
@@ -138,6 +142,10 @@ class Discovery:
         "V_D_V=300, mdot_mg_s=5". The model and all else are then those of the most central point.
     law : OperatingLaw, optional
         The law of all coefficients over the operating points, if it was asked for.
+    records : sequence of Trajectory, default ()
+        The samples that the model is judged by, hidden states among them as they were estimated.
+    judged : str, default ''
+        The verdict, of a discovery that was read from a file, which holds no samples.
 
     Examples
     --------
@@ -162,6 +170,27 @@ class Discovery:
     others: Sequence[OtherSystem] = field(default=(), repr=False)
     points: Mapping[str, Discovery] = field(default_factory=dict, repr=False)
     law: OperatingLaw | None = field(default=None, repr=False)
+    records: Sequence[Trajectory] = field(default=(), repr=False)
+    judged: str = ""
+
+    @cached_property
+    def evaluation(self) -> Evaluation | None:
+        """What is said of the model, by the records that it was found in; None without these."""
+        if not self.records or not self.model.coef.any():
+            return None
+        states, found = self.model.states, self.estimate
+        noise = np.zeros(len(states)) if found is None else found.noise_std
+        measured = [s for s, std in zip(states, noise, strict=True) if not np.isnan(std)]
+        return evaluate(self, self.records, assessed=measured)
+
+    @property
+    def verdict(self) -> str:
+        """What is said of the model, in a few words; see `Evaluation.heading`."""
+        if self.points:
+            words = [own.verdict for own in self.points.values()]
+            counts = Counter(word for word in words if word)
+            return ", ".join(f"{word} at {n}" for word, n in counts.most_common())
+        return self.judged if self.evaluation is None else self.evaluation.heading
 
     @property
     def scores(self) -> dict[str, Float[np.ndarray, " _candidates"]]:
@@ -189,10 +218,14 @@ class Discovery:
         return self.model.simulate(t, x0, inputs, draws=draws, seed=seed)
 
     def score(
-        self, run: Run, *, x_dot: Float[np.ndarray, "samples n_states"] | None = None
+        self,
+        runs: Runs,
+        *,
+        x_dot: Float[np.ndarray, "samples n_states"] | None = None,
+        horizon_s: float | None = None,
     ) -> float:
-        """R2 of the model's derivative over a run; see `SparseModel.score`."""
-        return self.model.score(run, x_dot=x_dot)
+        """R2 of the model's forecasts over one step; see `SparseModel.score`."""
+        return self.model.score(runs, x_dot=x_dot, horizon_s=horizon_s)
 
     def forecast(
         self,
@@ -243,6 +276,7 @@ class Discovery:
         content |= {name: _encode(getattr(parts, name)) for name in _PARTS}
         content["points"] = {label: json.loads(own.to_json()) for label, own in self.points.items()}
         content["law"] = None if self.law is None else json.loads(self.law.to_json())
+        content["judged"] = self.verdict
         return json.dumps(content, indent=1, allow_nan=False) + "\n"
 
     @staticmethod
@@ -257,6 +291,7 @@ class Discovery:
             law, points = content["law"], content["points"]
             found = Discovery(
                 model=model,
+                judged=str(content["judged"]),
                 **{name: _decode(content[name]) for name in _PARTS},
                 points={p: Discovery.from_json(json.dumps(own)) for p, own in points.items()},
                 law=None if law is None else OperatingLaw.from_json(json.dumps(law)),
@@ -278,7 +313,7 @@ class Discovery:
         notes = [line for each in shown for line in sentences(f"note: {each}")]
         left = len(self._notes()) - len(shown)
         tail = [*notes, *([f"... {left} more notes"] if left else [])]
-        head = [self._headline(), *(sentences(self.note) if self.note else [])]
+        head = [line for text in self._lines_of_choice() for line in sentences(text)]
         n_lines = N_LINES - len(head) - len(tail)
         body = model_lines(self.model, self.constraint, n_lines=n_lines)
         if self.points:
@@ -296,7 +331,7 @@ class Discovery:
 
     def _repr_html_(self) -> str:
         notes = "".join(f"<li>{html.escape(each)}</li>" for each in self._notes())
-        lines = [self._headline(), *([self.note] if self.note else [])]
+        lines = self._lines_of_choice()
         if self.points:
             lines += self._lines_of_points()
         head = "".join(f"<div>{html.escape(line)}</div>" for line in lines)
@@ -309,13 +344,19 @@ class Discovery:
     def _notes(self) -> list[str]:
         return [*self.data_warnings, *(each.message for each in self.ambiguities)]
 
+    def _lines_of_choice(self) -> list[str]:
+        """The verdict, how the model was chosen, and what that left open."""
+        chosen = f"chosen by {self.method.selection!r}"
+        return [self._headline(), chosen, *([self.note] if self.note else [])]
+
     def _headline(self) -> str:
         where = ""
         if self.points:
             how = "one law" if self.law else "one support" if self._is_shared else "each alone"
             where = f" at {len(self.points)} operating points, {how}"
         n = len(self.model.states)
-        return f"Discovery of {n} equations{where}, chosen by {self.method.selection!r}"
+        verdict = f": {self.verdict}" if self.verdict else ""
+        return f"Discovery of {n} equations{where}{verdict}"
 
     @property
     def _is_shared(self) -> bool:

@@ -1,9 +1,9 @@
-"""How a model does on a record: its free run, cycle, rest points, forecasts and lack of fit."""
+"""What is said of a model: how it follows samples, keeps a cycle, and forecasts; the only judge."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from html import escape
 from textwrap import wrap
@@ -14,34 +14,54 @@ import numpy as np
 from jaxtyping import Float
 
 from ep2sindy.data.numbers import zero_to_one
-from ep2sindy.data.runs import Run, trajectory_of
+from ep2sindy.data.runs import Runs, trajectories_of
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.forecasting.baselines import check_fitted
+from ep2sindy.forecasting.following import Following
 from ep2sindy.forecasting.skill import ForecastSkill, forecast_skill
-from ep2sindy.model.comparison import ComparedRecord, FreeRunBounds, Status, columns_of, record_of
-from ep2sindy.model.fixed_point import RestPoint, rest_point
+from ep2sindy.library.terms import variables_of
+from ep2sindy.model.comparison import (
+    ComparedRecord,
+    Comparison,
+    FreeRunBounds,
+    Status,
+    columns_of,
+    record_of,
+)
+from ep2sindy.model.fixed_point import UNDETERMINED, RestPoint, rest_point, rest_points
 from ep2sindy.model.model import SparseModel
+from ep2sindy.model.restarts import OneStep, one_step
 from ep2sindy.model.rollout import Rollout
 from ep2sindy.model.stability import (
-    LEAST_WAIT,
     LimitCycle,
     basin_stability,
+    end_of_long_run,
     limit_cycle,
-    periods_to_reach,
+    multiplier_error,
 )
 from ep2sindy.runtime.screen import WIDTH, html_table, one_screen, text_table
 from ep2sindy.runtime.values import check_kind
 from ep2sindy.signals.attractor import follow_phase
 from ep2sindy.signals.spectrum import DECAYED, dominant_frequency
 
-N_REST = 16  # samples of a record from which rest points are looked for
 IN_PHASE = 0.25  # periods, by which a run that is in phase may be ahead or behind
-NEUTRAL = 1e-6  # growth per turn of a perturbation from a rest point that neither grows nor decays
-# Distance of two rest points, in standard deviations: Newton's method ends short of multiple roots.
-APART = 1e-2
 STD, WIDEST = " standard deviations", len("amplitude ratio  ")
 LEFT = 100.0  # times a record's size, from which a run's is not reported
 N_SHOWN = 4  # most states, and most rest points, that the table shows one by one
+
+# What a comparison with a cycle says of a run, which says nothing of a model under inputs.
+CYCLIC = (
+    Status.SUSTAINED,
+    Status.WRONG_FREQUENCY,
+    Status.WRONG_CYCLE,
+    Status.NO_CYCLE,
+    Status.DECAYS,
+)
+MOST_WORDS = 11  # of a verdict, so that its heading has twelve with a name
+
+# A cycle attracts if its multiplier lies below one by this many standard errors, and if runs of
+# this many relaxation times stay on it.
+ERRORS, RELAXATIONS = 2.0, 3.0
 
 
 @runtime_checkable
@@ -58,9 +78,13 @@ class HoldsModel(Protocol):
 class Evaluation:
     """How a model does on a record: integrated from one sample, driven by its inputs if it has any.
 
-    Only the second halves are compared, after transients. If the record does not repeat one
-    waveform, or has fewer than eight periods, all of it is compared. Cycle, rest points and
-    forecasts are computed when they are first asked for.
+    It is judged in this order. By samples: if a run from a start that is fitted to them stays
+    within their noise, it follows them. By the cycle, of a record without inputs that repeats one:
+    a run from its first sample has to stay on it, and it has to attract. By forecasts.
+
+    Cycles are compared over second halves, after transients. If the record does not repeat one
+    waveform, or has fewer than eight periods, all of it is compared. Whatever takes runs of its own
+    is computed when it is first asked for.
 
     Parameters
     ----------
@@ -72,52 +96,167 @@ class Evaluation:
         The run of the model.
     compared : ComparedRecord
         The part of the record that is compared.
-    status : Status
-        How the run goes.
-    is_similar : bool
-        Whether the run is like the record: sustained, or, without a cycle to compare, with its
-        envelope, or with its means and amplitudes.
-    f_error : float
-        Relative error of the frequency. NaN for a run that diverged, or if the record or the run
-        has no period.
-    amplitude_ratio : mapping of str to float
-        Standard deviation of each state relative to the record's. NaN for a run that diverged.
-    waveform_error : mapping of str to float
-        Difference of the waveforms of each state, in standard deviations. NaN for a run that
-        diverged, or if the record or the run has no period.
+    comparison : Comparison
+        How the run compares with the record's cycle, or with its statistics without one.
+    bounds : FreeRunBounds
+        Largest deviations at which the run counts as staying on the record's cycle.
+    assessed : sequence of int
+        Numbers of the states that determine the status.
     lack_of_fit : str, default ''
         Why the model does not explain the data it was found from. Empty if it does, or if that is
         not known.
     forecasts : callable, optional
         Makes `forecast`. None without held-out samples.
+    each : sequence of Evaluation, default ()
+        Of several records, the evaluation of each; all else is then that of the worst.
     """
 
     model: SparseModel
     record: Trajectory
     rollout: Rollout
     compared: ComparedRecord
-    status: Status
-    is_similar: bool
-    f_error: float
-    amplitude_ratio: Mapping[str, float]
-    waveform_error: Mapping[str, float]
+    comparison: Comparison
+    bounds: FreeRunBounds
+    assessed: Sequence[int]
     lack_of_fit: str = ""
-    forecasts: Callable[[], ForecastSkill] | None = field(default=None, repr=False)
+    forecasts: Callable[[], ForecastSkill | None] | None = field(default=None, repr=False)
+    each: Sequence[Evaluation] = ()
+
+    @property
+    def is_similar(self) -> bool:
+        """Whether the run is like the record.
+
+        It stays on the cycle, or, without a cycle to compare, it has the record's envelope, or its
+        means and amplitudes.
+        """
+        return self.comparison.is_similar
+
+    @property
+    def f_error(self) -> float:
+        """Relative error of the frequency; NaN if the run diverged, or without a period."""
+        return self.comparison.f_error
+
+    @property
+    def amplitude_ratio(self) -> Mapping[str, float]:
+        """Standard deviation of each state relative to the record's; NaN if the run diverged."""
+        return self._by_state("amplitude_ratio")
+
+    @property
+    def waveform_error(self) -> Mapping[str, float]:
+        """Difference of the waveforms of each state, in standard deviations; NaN without one."""
+        return self._by_state("waveform_error")
+
+    def _by_state(self, name: str) -> Mapping[str, float]:
+        values = self.comparison.by_state[name].tolist()
+        return MappingProxyType(dict(zip(self.model.states, values, strict=True)))
+
+    @cached_property
+    def status(self) -> Status:
+        """The verdict by samples and cycle: the first of `Status` that holds."""
+        if self.model.coef.any() and self.following.followed_s:
+            return Status.FOLLOWS
+        if self.is_driven and self.comparison.status in CYCLIC:
+            return Status.DEPARTS
+        return self._stability if self.comparison.stays else self.comparison.status
+
+    @property
+    def holds(self) -> bool:
+        """Whether the model follows the samples, or sustains their oscillation."""
+        return self.status in (Status.FOLLOWS, Status.SUSTAINED)
+
+    @property
+    def is_driven(self) -> bool:
+        """Whether inputs drive the model, or were among what its terms were chosen from."""
+        return bool(self.model.inputs)
+
+    @cached_property
+    def _stability(self) -> Status:
+        """What becomes of a run that stays on the record's cycle as long as this was recorded."""
+        cycle, length_s = self.cycle, float(self.record.t[-1] - self.record.t[0])
+        if cycle is None:
+            return self._after(RELAXATIONS * length_s)
+        if cycle.stability != "attracting":
+            return Status.NEUTRAL if cycle.stability == "neutral" else Status.REPELLING
+        needed_s = RELAXATIONS * cycle.relaxation_s
+        surely = 1.0 - self.multiplier > ERRORS * multiplier_error(cycle)
+        return Status.SUSTAINED if surely and needed_s <= length_s else self._after(needed_s)
+
+    def _after(self, duration_s: float) -> Status:
+        """Sustained, if another solver stays on the record's cycle for so long; else not told."""
+        data = self.compared.cycle
+        assert data is not None
+        start, period_s = self.rollout.states[0], 1.0 / data.frequency_Hz
+        end = end_of_long_run(self.model, start, duration_s, period_s)
+        if end is None:
+            return Status.NOT_TOLD
+        late = replace(self.compared, t=end[0], states=end[1]).similarity(end[1], self.bounds)
+        return Status.SUSTAINED if late.stays else Status.NOT_TOLD
+
+    @cached_property
+    def following(self) -> Following:
+        """How near runs stay to the samples, in units of their noise."""
+        return Following(self.model, self.record, self.rollout, self.compared, self.assessed)
+
+    @property
+    def distance(self) -> Mapping[str, float]:
+        """Distance of a run from each state's samples, in units of their noise (`Following`)."""
+        values = self.following.distances.tolist()
+        return MappingProxyType(dict(zip(self.model.states, values, strict=True)))
+
+    @cached_property
+    def one_step(self) -> OneStep:
+        """Forecasts over one step, from samples alone; of several records, over all of them."""
+        return one_step(self.model, [run.record for run in self.each or [self]])
+
+    @property
+    def rival(self) -> str:
+        """What forecasts the first steps better than the model, in words; empty if nothing does.
+
+        It vetoes a model: equations that forecast worse than the last sample, or than the mean,
+        are no more than candidates.
+        """
+        if self.status is Status.FOLLOWS:
+            return ""
+        return self.one_step.rival if self.forecast is None else self.forecast.veto
 
     @property
     def text(self) -> str:
         """The status, and after which time a run diverged or left a domain."""
-        if self.status is Status.NO_CYCLE:
-            are = "are" if self.is_similar else "are not"
-            return f"{self.status}; its means and amplitudes {are} the record's"
-        of = f" of {self.rollout.outside}" if self.rollout.outside else ""
-        lasted = self.rollout.lasted_text if self.rollout.diverged else ""
-        return f"{self.status}{of} after {lasted}" if lasted else str(self.status)
+        if self.status is Status.FOLLOWS:
+            return f"{self.status} {self.following.text}"
+        return self.run_text if self.status is self.comparison.status else str(self.status)
 
     @property
-    def rank(self) -> tuple[bool, int]:
-        """Sorts the best first: by whether the run is like the record, then by the status."""
-        return not self.is_similar, list(Status).index(self.status)
+    def run_text(self) -> str:
+        """How the run from one sample compares with the record."""
+        status = self.comparison.status
+        if status is Status.NO_CYCLE:
+            are = "are" if self.is_similar else "are not"
+            return f"{status}; its means and amplitudes {are} the record's"
+        of = f" of {self.rollout.outside}" if self.rollout.outside else ""
+        lasted = self.rollout.lasted_text if self.rollout.diverged else ""
+        return f"{status}{of} after {lasted}" if lasted else str(status)
+
+    @property
+    def heading(self) -> str:
+        """The verdict alone, in few words: by samples, by the cycle, and by forecasts."""
+        if not self.model.coef.any():
+            return "no law of any state"
+        if self.status is Status.FOLLOWS:
+            return self.text
+        if self.rival:
+            return f"no equations found: {self.rival} forecasts better"
+        forecasts = "" if self.forecast is None else self.forecast.text
+        own = str(self.comparison.status if self.status is Status.NO_CYCLE else self.status)
+        both = f"{own}; {forecasts}" if forecasts else self.text
+        if self.status is Status.NO_CYCLE and forecasts:
+            return forecasts
+        return both if len(both.split()) <= MOST_WORDS else forecasts if self.is_driven else own
+
+    @property
+    def rank(self) -> int:
+        """Sorts the best first."""
+        return list(Status).index(self.status)
 
     @cached_property
     def excursion(self) -> float:
@@ -200,7 +339,7 @@ class Evaluation:
     @cached_property
     def cycle(self) -> LimitCycle | None:
         """The closed orbit on which the run ends; None if it ends on none, or is driven."""
-        if self.model.inputs or self.rollout.diverged or self.status is Status.DECAYS:
+        if self.is_driven or self.rollout.diverged or self.comparison.status is Status.DECAYS:
             return None
         frequency_Hz = np.nanmax(list(self.frequency_Hz.values()), initial=0.0)
         if not frequency_Hz > 0.0:
@@ -228,34 +367,11 @@ class Evaluation:
 
     @cached_property
     def rest_points(self) -> tuple[RestPoint, ...]:
-        """Rest points that Newton's method reaches from samples of the record and their mean.
-
-        They lie within its range or one more on either side, for which alone the model was made. Of
-        a line of rest points there is one. Empty for a model with inputs. No density is negative.
-        """
+        """Rest points near the record (`ep2sindy.model.fixed_point`); none of a driven model."""
         if self.model.inputs:
             return ()
-        states, std = self.compared.states, self.compared.std
-        anywhere, width = np.zeros(len(std), dtype=np.bool_), np.ptp(states, axis=0)
-        low, high = states.min(axis=0) - width, states.max(axis=0) + width
-        low[list(self.compared.densities)] = 0.0
-        starts = (states.mean(axis=0), *states[:: max(1, len(states) // N_REST)])
-        found: list[RestPoint] = []
-        for near in starts:
-            point = rest_point(self.model, near, std, anywhere)
-            if point is None or not ((low <= point.state) & (point.state <= high)).all():
-                continue
-            lines = [p for p in (point, *found) if self._stays(p)]
-            if len(lines) == 2 and lines[0] is point:
-                continue
-            if all(np.abs((point.state - p.state) / std).max() > APART for p in found):
-                found.append(point)
-        return tuple(found)
-
-    def _stays(self, rest: RestPoint) -> bool:
-        """Whether nothing moves next to a rest point, in one direction at least."""
-        length_s = float(self.record.t[-1] - self.record.t[0])
-        return not rest.frequency_Hz and abs(rest.growth_per_s) * length_s < NEUTRAL
+        compared, length_s = self.compared, float(self.record.t[-1] - self.record.t[0])
+        return rest_points(self.model, compared.states, compared.std, compared.densities, length_s)
 
     @cached_property
     def forecast(self) -> ForecastSkill | None:
@@ -263,51 +379,84 @@ class Evaluation:
         return None if self.forecasts is None else self.forecasts()
 
     @property
-    def caution(self) -> str:
-        """A sentence if the cycle is neutral; else empty."""
-        if self.cycle is None or self.cycle.stability != "neutral":
+    def missing(self) -> str:
+        """What the model or the record lacks, in a sentence; empty if nothing is known to."""
+        terms = [term for state in self.model.states for term in self.model.terms(state)]
+        used = {variable for term in terms for variable in variables_of(term)}
+        unused = [name for name in self.model.inputs if name not in used]
+        if unused and self.status is not Status.FOLLOWS:
+            return f"No term of the model holds the input {' or '.join(unused)}."
+        if self.cycle is None or self.status is Status.FOLLOWS:
             return ""
-        return (
-            "the cycle is neutral: it neither attracts nor repels, and every start has a cycle of "
-            "its own, so the model does not show what sets the amplitude"
-        )
+        if self.status is Status.NEUTRAL:
+            return (
+                "Every start has a cycle of its own: the model does not show what sets the "
+                "amplitude."
+            )
+        if self.status is Status.REPELLING:
+            return "Perturbations of the model's cycle grow: it is left sooner or later."
+        if self.status is Status.NOT_TOLD:
+            turns = self.cycle.relaxation_s / self.cycle.period_s
+            return (
+                f"By the model a perturbation of its cycle lasts {turns:.0f} periods: a longer "
+                "record is needed to show whether it decays."
+            )
+        return ""
 
     @property
     def cycle_text(self) -> str:
-        """The stability of the cycle, in a sentence; empty without a cycle."""
+        """The stability of the cycle, in sentences; empty without a cycle."""
         if self.cycle is None:
             return ""
-        wait = periods_to_reach(self.cycle)
-        slowly = f", slowly, over {wait:.0f} periods" if wait > LEAST_WAIT else ""
-        text = (
-            f"The cycle is {self.cycle.stability}: of a perturbation {self.multiplier:.3g} is left "
-            f"after a period (Floquet multiplier); {100.0 * self.basin_stability:.0f} % of starts "
-            f"from 0.3 to 3 times the cycle's mean reach it{slowly}."
+        reached = f" From how far it is reached is {UNDETERMINED}."
+        return (
+            f"The model's cycle is {self.cycle.stability}: of a perturbation {self.multiplier:.3g} "
+            "is left after a period (Floquet multiplier)."
+            f"{reached if self.cycle.stability == 'attracting' else ''}"
         )
-        return text if self.rest is None else f"{text} It rests at {self._rest_text(self.rest)}."
 
     @property
     def rest_texts(self) -> list[str]:
         """The rest points near the record, each in a line."""
-        return [f"rests at {self._rest_text(rest)}" for rest in self.rest_points[:N_SHOWN]]
+        known = self.rest_points[:N_SHOWN]
+        return [f"rests at {each.text(self.model, self.rollout.clock)}" for each in known]
 
-    def _rest_text(self, rest: RestPoint) -> str:
-        """Where the model rests, and what becomes of a small perturbation."""
-        units, clock = self.model.units, self.rollout.clock
-        place = ", ".join(
-            f"{state} = {value:.3g}{'' if units[state] == '1' else f' {units[state]}'}"
-            for state, value in zip(self.model.states, rest.state.tolist(), strict=True)
-        )
-        kind, change = ("unstable", "grows") if rest.growth_per_s > 0.0 else ("stable", "decays")
-        rate = f" at {clock.seconds * abs(rest.growth_per_s):.3g} {clock.rate_unit('1')}"
-        if abs(rest.growth_per_s) <= NEUTRAL * rest.frequency_Hz or self._stays(rest):
-            kind, change, rate = "neutral", "neither grows nor decays", ""
-        turns = (
-            f" and oscillates at {clock.frequency_text(rest.frequency_Hz)}"
-            if rest.frequency_Hz
-            else ""
-        )
-        return f"{place}, {kind}: a perturbation {change}{rate}{turns}"
+    @property
+    def distance_text(self) -> str:
+        """`x 1.02, y 0.98 times the noise`; empty for a run that no start keeps finite."""
+        known = {state: f"{d:.3g}" for state, d in self.distance.items() if d <= LEFT}
+        return _listed(known, " times the noise of the samples")
+
+    @property
+    def table(self) -> list[tuple[str, str, str]]:
+        """Quantity, data and model, as text: of the cycle, or else the distance in noises."""
+        clock, states = self.rollout.clock, self.model.states
+        data, own = self.compared.cycle, self.frequency_Hz[states[0]]
+        rows = []
+        if data is not None and np.isfinite(self.f_error) and not self.is_driven:
+            error = f" ({100.0 * self.f_error:+.2g} %)"
+            rows.append(
+                (
+                    "frequency",
+                    clock.frequency_text(data.frequency_Hz),
+                    f"{clock.frequency_text(own)}{error}" if np.isfinite(own) else "-",
+                )
+            )
+        for state, std in list(zip(states, self.compared.std.tolist(), strict=True))[:N_SHOWN]:
+            ratio = self.amplitude_ratio[state]
+            unit = f" {self.model.units[state]}".removesuffix(" 1")
+            model = f"{ratio * std:.4g}{unit}" if ratio <= LEFT else size_text(ratio)
+            rows.append(
+                (f"amplitude of {state}", f"{std:.4g}{unit}", model if ratio == ratio else "-")
+            )
+        waveforms = [value for value in self.waveform_error.values() if np.isfinite(value)]
+        if waveforms and not self.is_driven:
+            rows.append(("waveform", "", f"within {max(waveforms):.2g}{STD}"))
+        if self.phase_text and not self.is_driven:
+            rows.append(("phase", "", self.phase_text))
+        elif self.distance_text:
+            rows.append(("distance", "", self.distance_text))
+        return rows
 
     @property
     def rows(self) -> list[tuple[str, str]]:
@@ -315,22 +464,32 @@ class Evaluation:
         clock = self.rollout.clock
         frequencies = {s: clock.frequency_text(f) for s, f in self.frequency_Hz.items() if f == f}
         error = f" ({100.0 * self.f_error:+.2g} %)" if np.isfinite(self.f_error) else ""
-        cycle = self.cycle and (
-            f"{self.cycle.stability}, multiplier {self.multiplier:.3g}; "
-            f"{100.0 * self.basin_stability:.0f} % of starts reach it"
-        )
-        found = [
-            ("forecasts", "" if self.forecast is None else self.forecast.text),
-            ("status", self.text),
+        compared = [
             ("frequency", _listed(frequencies) + error),
             ("amplitude ratio", _listed(_sizes(self.amplitude_ratio))),
             ("waveform error", _listed(_texts(self.waveform_error), STD)),
             ("phase", self.phase_text if np.isfinite(self.phase_end) else ""),
-            ("cycle", cycle or ""),
-            *(("rests at", self._rest_text(rest)) for rest in self.rest_points[:N_SHOWN]),
+            ("cycle", self.cycle_text),
+        ]
+        found = [
+            ("status", self.text),
+            ("distance", self.distance_text),
+            *([] if self.is_driven else compared),
+            *(("rests", text.removeprefix("rests ")) for text in self.rest_texts),
+            ("score", self._score_text),
+            ("forecasts", "" if self.forecast is None else self.forecast.text),
+            ("missing", self.missing),
             ("lack of fit", self.lack_of_fit),
         ]
         return [(name, value) for name, value in found if value]
+
+    @property
+    def _score_text(self) -> str:
+        """Of forecasts over one step; empty for a record too short for one."""
+        try:
+            return self.one_step.text
+        except ValueError:
+            return ""
 
     def __repr__(self) -> str:
         rows = [
@@ -346,7 +505,7 @@ class Evaluation:
 
 def evaluate(
     model: SparseModel | HoldsModel,
-    run: Run,
+    runs: Runs,
     *,
     initial: Float[np.ndarray, " n_states"] | None = None,
     n_samples: int | None = None,
@@ -354,23 +513,25 @@ def evaluate(
     assessed: Sequence[str] | None = None,
     n_fitted: int | None = None,
 ) -> Evaluation:
-    """Integrate a model over a record and compare the attractors of both.
+    """Judge a model by one record or several.
 
-    The result states whether the model sustains the record's oscillation, with its frequency,
-    amplitudes and waveform, and how stable its cycle is.
+    The result states whether the model follows the samples to within their noise; if not, whether
+    it sustains the record's oscillation, with its frequency, amplitudes and waveform; and how far
+    it forecasts, next to forecasts without a model.
 
     Parameters
     ----------
     model : SparseModel, or Discovery
         The model. The lack of fit of a discovery is reported as well.
-    run : run
-        A Trajectory, or whatever `discover` takes as one run.
+    runs : run, or list or dict of runs
+        A Trajectory, or whatever `discover` takes. Of several, the result is that of the worst
+        record, and `each` has all of them.
     initial : (n_states,) array, optional
         State to start from, in SI. None takes the data's first sample.
     n_samples : int, optional
         Number of samples of the run that are compared. None takes all.
     bounds : FreeRunBounds, optional
-        Largest deviations at which the run counts as sustained.
+        Largest deviations at which the run counts as staying on the record's cycle.
     assessed : sequence of str, optional
         States that determine the status and the frequency error, such as the measured one. None
         takes all.
@@ -392,40 +553,52 @@ def evaluate(
     --------
     >>> run = ep.lotka_volterra().trajectory(noise=0.02, rng=0)
     >>> str(ep.evaluate(ep.lotka_volterra().model, run).status)
-    'sustained'
+    'follows the samples'
     """
-    lack_of_fit, forecasts = "", None
+    lack_of_fit = ""
     if isinstance(model, HoldsModel):
         lack_of_fit, model = model.lack_of_fit, model.model
     check_kind("model", model, SparseModel, "found.model")
-    whole = part = trajectory_of(run)
+    found = [
+        _evaluate(model, run, initial, n_samples, bounds or FreeRunBounds(), assessed, n_fitted)
+        for run in trajectories_of(runs, partial=True)
+    ]
+    found = [replace(one, lack_of_fit=lack_of_fit) for one in found]
+    return found[0] if len(found) == 1 else replace(max(found, key=lambda e: e.rank), each=found)
+
+
+def _evaluate(
+    model: SparseModel,
+    whole: Trajectory,
+    initial: Float[np.ndarray, " n_states"] | None,
+    n_samples: int | None,
+    bounds: FreeRunBounds,
+    assessed: Sequence[str] | None,
+    n_fitted: int | None,
+) -> Evaluation:
+    """The evaluation over one record."""
+    part, forecasts = whole, None
     if n_fitted is not None:
         check_fitted(whole, n_fitted)
         part = whole.window(n_fitted - 1, whole.n_samples)
         forecasts = partial(forecast_skill, model, whole, n_fitted=n_fitted)
     n_samples = part.n_samples if n_samples is None else min(n_samples, part.n_samples)
     rollout = model.rollout(part, n_samples=n_samples, initial=initial)
-    part, bounds = part.window(0, n_samples), bounds or FreeRunBounds()
+    part, columns = part.window(0, n_samples), columns_of(model.states, assessed)
     compared = record_of(part, model.states)
-    similarity = ours = compared.similarity(rollout.states, bounds)
+    found = ours = compared.similarity(rollout.states, bounds)
     if assessed is not None:
-        columns = columns_of(model.states, assessed)
         ours = record_of(part, assessed).similarity(rollout.states[:, columns], bounds)
-    by_state = {
-        name: MappingProxyType(dict(zip(model.states, values.tolist(), strict=True)))
-        for name, values in similarity.by_state.items()
-    }
+    status = Status.LEAVES_DOMAIN if rollout.outside else ours.status
     return Evaluation(
         model=model,
         record=part,
         rollout=rollout,
         compared=compared,
-        status=Status.LEAVES_DOMAIN if rollout.outside else ours.status,
-        is_similar=ours.is_similar,
-        f_error=ours.f_error,
-        lack_of_fit=lack_of_fit,
+        comparison=replace(ours, status=status, by_state=found.by_state),
+        bounds=bounds,
+        assessed=columns,
         forecasts=forecasts,
-        **by_state,
     )
 
 

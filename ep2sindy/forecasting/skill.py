@@ -48,13 +48,15 @@ from ep2sindy.signals.spectrum import is_uniform
 
 PERIODS_AHEAD = 4.0  # longest horizon
 NEARER = 0.9  # fraction of the model's error below which a baseline is clearly nearer
-CLOSE = 0.5  # error, in standard deviations, halfway to the mean, whose error is one
-MODEL = "model"
+EARLY = 0.25  # periods, over which a forecast must not be worse than the last sample or the mean
+MODEL, MEAN = "model", "mean"
 WORDS = {
+    MODEL: "the model",
     PERSISTENCE: "the last sample",
     HARMONICS: "the mean cycle",
     AUTOREGRESSION: "the autoregression",
-    NEIGHBOURS: "the record's own past (nearest neighbours)",
+    NEIGHBOURS: "nearest neighbours",
+    MEAN: "the mean",
 }
 
 # Errors are averaged over horizons of a twentieth of a period, or a 120th of the longest. At one
@@ -111,22 +113,33 @@ class ForecastSkill:
         return AUTOREGRESSION if AUTOREGRESSION in self.nrmse else PERSISTENCE
 
     @cached_property
-    def n_better(self) -> int:
-        """Number of horizons, from the first on, over which the model is better than the rival.
+    def better(self) -> tuple[int, int] | None:
+        """First and last horizon of the longest span at which the model is better than the rival.
 
         At each of them the gain in mean square error, over the rival and over the mean of the
         samples, exceeds its standard error over the starts; averaged over all of them, the gain
-        over the rival is one that chance makes in a case of twenty.
+        over the rival is one that chance makes in a case of twenty. None if there is no such span.
         """
-        own, n = self.squared[MODEL], 0
+        own = self.squared[MODEL]
         gain = self.squared[self.rival] - own
-        while n < own.shape[1] and all(
-            self._exceeds(each[:, n], n, EXCEEDS) for each in (gain, 1.0 - own)
-        ):
-            n += 1
-        while n and not self._exceeds(gain[:, :n].mean(axis=1), n - 1, SURE):
-            n -= 1
-        return n
+        exceeds = [
+            all(self._exceeds(each[:, n], n, EXCEEDS) for each in (gain, 1.0 - own))
+            for n in range(own.shape[1])
+        ]
+        for first, last in _spans(exceeds):
+            if self._exceeds(gain[:, first : last + 1].mean(axis=1), last, SURE):
+                return first, last
+        return None
+
+    @cached_property
+    def nearer(self) -> tuple[int, int] | None:
+        """The longest span at which it errs less than nine tenths of the rival, or None.
+
+        It has to be over half of the horizons, and may be by chance.
+        """
+        near = self.nrmse[MODEL] < NEARER * np.minimum(self.nrmse[self.rival], 1.0)
+        spans = _spans(near.tolist())
+        return spans[0] if 2 * near.sum() > len(near) else None
 
     def _exceeds(self, gain: Float[np.ndarray, " starts"], horizon: int, level: float) -> bool:
         """Whether gains of the starts are positive next to their standard error."""
@@ -140,79 +153,77 @@ class ForecastSkill:
 
     @property
     def is_better(self) -> bool:
-        """Whether the model forecasts better than the rival from the first horizon on."""
-        return self.n_better > 0
+        """Whether the model forecasts better than the rival at some horizons."""
+        return self.better is not None
 
     @property
-    def better_until_periods(self) -> float:
-        """How long it does, in periods, or in samples for a record without an oscillation."""
-        return self._until(self.n_better)
+    def better_periods(self) -> tuple[float, float] | None:
+        """From where to where it does, in periods, or in samples without an oscillation."""
+        return self._in_units(self.better)
+
+    def _in_units(self, span: tuple[int, int] | None) -> tuple[float, float] | None:
+        if span is None:
+            return None
+        first, last = span
+        begin = float(self.horizons_s[first - 1]) if first else 0.0
+        return begin / self.unit_s, float(self.horizons_s[last]) / self.unit_s
+
+    def _span(self, span: tuple[int, int]) -> str:
+        """`from 0.3 to 4 periods`, or `up to 4 periods`."""
+        begin, end = self._in_units(span) or (0.0, 0.0)
+        return (
+            f"from {begin:.2g} to {end:.2g} {self.unit}"
+            if begin
+            else f"up to {end:.2g} {self.unit}"
+        )
 
     @property
-    def close_until_periods(self) -> float:
-        """How long, from the first horizon on, the model errs by less than `CLOSE`, likewise."""
-        far = self.nrmse[MODEL] >= CLOSE
-        return self._until(int(np.argmax(far)) if far.any() else len(far))
+    def veto(self) -> str:
+        """What forecasts the first horizons better than the model; empty if nothing simple does.
 
-    def _until(self, n: int) -> float:
-        return float(self.horizons_s[n - 1]) / self.unit_s if n else 0.0
-
-    def _span(self, until: float) -> str:
-        """`3.1 periods`, and whether it is all that was asked."""
-        more = " and more" if until * self.unit_s >= self.horizons_s[-1] else ""
-        return f"{until:.2g} {self.unit}{more}"
-
-    @property
-    def nearest(self) -> str:
-        """What is nearest to the samples over all horizons, in words; a model if that is sure."""
-        gain = self.squared[self.rival] - self.squared[MODEL]
-        mean = {name: float(errors.mean()) for name, errors in self.nrmse.items()}
-        if not self._exceeds(gain.mean(axis=1), -1, SURE):
-            del mean[MODEL]
-        least = min(mean, key=mean.__getitem__)
-        if mean[least] >= 1.0:
-            return "the mean of the record"
-        return WORDS.get(least, "the model, over all horizons,")
+        It is the last sample or the mean of the record, over the first quarter of a period, or a
+        sixteenth of all horizons, by more than chance makes in a case of twenty.
+        """
+        early = self.horizons_s <= EARLY * self.period_s
+        early |= np.arange(len(early)) < max(1, len(early) // 16)
+        own, last = self.squared[MODEL][:, early].mean(axis=1), int(np.flatnonzero(early)[-1])
+        rivals = {
+            "the last sample": self.squared[PERSISTENCE][:, early].mean(axis=1),
+            "the mean": np.ones(len(own)),
+        }
+        lost = [name for name, each in rivals.items() if self._exceeds(own - each, last, SURE)]
+        return lost[0] if lost else ""
 
     @property
     def text(self) -> str:
-        """One sentence, such as `better than an autoregression (AR 18) for 3.1 periods`."""
-        rival = f"an autoregression (AR {self.order})" if self.order else WORDS[self.rival]
-        if not self.is_better:
-            nearest = self.nearest
-            return f"no better than {rival}" + f"; {nearest} is best" * (
-                nearest != WORDS[self.rival]
-            )
-        span = self._span(self.better_until_periods)
-        return f"better than {rival} for {span}{self._beside_others()}"
+        """The verdict by ranges of horizons, `better than an autoregression up to 4 periods`."""
+        rival = "an autoregression" if self.rival == AUTOREGRESSION else "the last sample"
+        if self.better is not None:
+            return f"better than {rival} {self._span(self.better)}"
+        if self.nearer is not None:
+            return f"nearer than {rival} {self._span(self.nearer)}, within chance"
+        return f"no better than {rival}"
 
     @property
-    def headline(self) -> str:
-        """What was found, by what it foresees: `a model that forecasts better than ...`.
+    def nearest_text(self) -> str:
+        """Which forecast errs least, by ranges of horizons, in a sentence.
 
-        A model that is no better, but close for a period or more, is reported with how long it is:
-        a record without noise that repeats itself is foreseen by anything linear as well.
+        A change of less than a tenth of the error, or for less than a tenth of the horizons, is
+        passed over.
         """
-        if self.is_better:
-            return f"a model that forecasts {self.text}"
-        least = 1.0 if self.unit == "periods" else self._until(len(self.horizons_s))
-        until = self.close_until_periods
-        if until < least:
-            return f"nothing that forecasts {self.text.removeprefix('no ')}"
-        return (
-            f"a model that forecasts within half a standard deviation for {self._span(until)}, "
-            f"{self.text}"
-        )
-
-    def _beside_others(self) -> str:
-        """A warning if the mean cycle or neighbours are nearer than the model at most horizons."""
-        nearer = [
-            WORDS[name]
-            for name in (HARMONICS, NEIGHBOURS)
-            if name in self.nrmse and (self.nrmse[name] < NEARER * self.nrmse[MODEL]).mean() > 0.5
+        names = [*self.nrmse, MEAN]
+        errors = np.array([*self.nrmse.values(), np.ones(len(self.horizons_s))])
+        best: list[int] = []
+        for column in errors.T:
+            least = int(column.argmin())
+            kept = best and column[least] > NEARER * column[best[-1]]
+            best.append(best[-1] if kept else least)
+        ends = [k for k in range(len(best)) if k + 1 == len(best) or best[k] != best[k + 1]]
+        parts = [
+            f"{WORDS[names[best[k]]]} up to {float(self.horizons_s[k]) / self.unit_s:.2g}"
+            for k in ends
         ]
-        are = "are" if len(nearer) > 1 else "is"
-        return f"; {' and '.join(nearer)} {are} nearer at most horizons" if nearer else ""
+        return f"Least error: {', '.join(parts)} {self.unit}."
 
     def at(self, horizon_s: float) -> dict[str, float]:
         """Errors at the horizon nearest to the given one, by who forecasts."""
@@ -225,12 +236,10 @@ class ForecastSkill:
         places = sorted({round(k / 16 * last) for k in (0, 1, 2, 4, 8, 12, 16)})
         return {
             "text": self.text,
-            "headline": self.headline,
             "is_better": self.is_better,
             "horizons_periods": [h / self.unit_s for h in self.horizons_s[places].tolist()],
             "nrmse": {name: values[places].tolist() for name, values in self.nrmse.items()},
-            "better_until_periods": self.better_until_periods,
-            "close_until_periods": self.close_until_periods,
+            "better_periods": self.better_periods,
             "unit_s": self.unit_s,
             "coverage_90": self.coverage_90,
         }
@@ -243,6 +252,13 @@ class ForecastSkill:
     @property
     def unit(self) -> str:
         return "periods" if np.isfinite(self.period_s) else "samples"
+
+
+def _spans(holds: Sequence[bool]) -> list[tuple[int, int]]:
+    """First and last place of every span of neighbours that hold, the longest first."""
+    edges = np.flatnonzero(np.diff([0, *holds, 0]))
+    found = [(int(a), int(b) - 1) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+    return sorted(found, key=lambda span: span[0] - span[1])
 
 
 @one_thread()

@@ -36,9 +36,14 @@ FIRST_PERIOD, TOO_NOISY = 0.3, 0.1
 
 
 class Status(StrEnum):
-    """How a model's run goes next to a record, the best first.
+    """What is said of a model next to a record, the best first; see `Evaluation.status`.
 
-    - sustained: the run stays on the record's cycle.
+    - follows the samples: to within their noise. Nothing below overrules this.
+    - sustained: a run from the record's start stays on the record's cycle, and this attracts.
+    - not told: the run stays on it, but the cycle attracts too slowly for the record to show it.
+    - neutral, repelling: the run stays on it, but perturbations of the cycle stay, or grow.
+    - departs from the samples: by more than their noise, of a record with inputs, which set what
+      oscillates, so that there is no cycle of the model's own to compare.
     - wrong frequency: amplitudes and waveform are the record's, and the frequency is not, or the
       run misses the record in the first period already.
     - wrong cycle: the run oscillates with other amplitudes or another waveform.
@@ -48,7 +53,12 @@ class Status(StrEnum):
     - decays, turns negative, leaves the domain (of a function of the model), diverges.
     """
 
+    FOLLOWS = "follows the samples"
     SUSTAINED = "sustained"
+    NOT_TOLD = "not told: relaxation is longer than the record"
+    NEUTRAL = "on a neutral cycle"
+    REPELLING = "on a repelling cycle"
+    DEPARTS = "departs from the samples"
     WRONG_FREQUENCY = "wrong frequency"
     WRONG_CYCLE = "wrong cycle"
     NO_CYCLE = "no cycle to compare"
@@ -93,12 +103,26 @@ class FreeRunBounds:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Comparison of one run with a record; the fields are those of `Evaluation`."""
+    """Comparison of one run with the cycle of a record, or with its statistics without one.
+
+    status: SUSTAINED says that the run stays within the bounds of the cycle; whether it would stay
+    for longer, `Evaluation.status` finds out. The other fields are those of `Evaluation`.
+    """
 
     status: Status
     is_similar: bool
     f_error: float
     by_state: Mapping[str, Float[np.ndarray, " n_states"]]
+
+    @property
+    def rank(self) -> tuple[bool, int]:
+        """Sorts the best first: by whether the run is like the record, then by the status."""
+        return not self.is_similar, list(Status).index(self.status)
+
+    @property
+    def stays(self) -> bool:
+        """Whether the run stays within the bounds of the record's cycle."""
+        return self.status is Status.SUSTAINED
 
 
 def deviation(
@@ -169,7 +193,7 @@ class ComparedRecord:
         if spirals(self.states):
             is_similar = self._is_followed(states, bounds)
             return Comparison(Status.NO_CYCLE, is_similar, np.nan, by_state)
-        is_similar = not self._repeats and self._is_alike(states, bounds)
+        is_similar = not self.repeats and self._is_alike(states, bounds)
         if is_similar or self.cycle is None:
             return Comparison(Status.NO_CYCLE, is_similar, np.nan, by_state)
         f_error, amplitude, waveform = compare_cycles(self.cycle, self.t[half:], late)
@@ -206,14 +230,14 @@ class ComparedRecord:
         return bool((off <= bounds.amplitude).all() and near)
 
     @property
-    def _repeats(self) -> bool:
+    def repeats(self) -> bool:
         """True if the record repeats one cycle; otherwise runs are compared by statistics first."""
         return self.cycle is not None and self.cycle.repeats
 
     @property
     def _is_long(self) -> bool:
         """True if half of the record holds enough periods to compare."""
-        return self._repeats and self.cycle is not None and self.cycle.n_periods >= LONG
+        return self.repeats and self.cycle is not None and self.cycle.n_periods >= LONG
 
     def _is_alike(self, states: np.ndarray, bounds: FreeRunBounds) -> bool:
         """True if means and amplitudes are as near to the record's as those of its thirds are."""

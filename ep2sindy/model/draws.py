@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.model.inputs import Curve
@@ -96,26 +96,48 @@ def _fine_enough(
     bound: Float[np.ndarray, " n_states"],
 ) -> WindowSteps:
     """Steps between the samples that follow the central run."""
-
-    def runs(starts: np.ndarray, first: np.ndarray, n_samples: int, n_substeps: int) -> np.ndarray:
-        steps = WindowSteps.along(t, drive, first, n_samples, n_substeps)
-        found = run_many(field, starts[None], steps, centre=np.zeros(len(bound)), reach=bound)
-        return found[0]
-
     n, begin = 1, np.zeros(1, dtype=np.int64)
-    run = runs(start[None], begin, len(t), n)[0]
+    run = _runs(field, start[None], t, drive, begin, len(t), n, bound)[0]
     some = np.linspace(0, len(t) - 2, min(len(t) - 1, 40)).astype(np.int64)
     while n < MAX_SUBSTEPS:
-        finer = runs(start[None], begin, len(t), 2 * n)[0]
-        # A chaotic run leaves its neighbours: steps, not whole runs, are compared.
-        coarse, fine = (runs(finer[some], some, 2, m)[:, 1] for m in (n, 2 * n))
-        off = np.abs(coarse - fine) / zero_to_one(np.abs(run).max(axis=0))
+        finer = _runs(field, start[None], t, drive, begin, len(t), 2 * n, bound)[0]
+        off = step_error(field, finer[some], t, drive, some, n, bound) / zero_to_one(
+            np.abs(run).max(axis=0)
+        )
         if not np.isfinite(run).all():
             off = np.full(1, np.inf if np.isfinite(finer).all() or n < 8 else 0.0)
         if off.max() <= ACCURATE:
             break
         n, run = 2 * n, finer
     return WindowSteps.along(t, drive, begin, len(t), n)
+
+
+def step_error(
+    field: VectorField,
+    starts: Float[np.ndarray, "starts n_states"],
+    t: Float[np.ndarray, " samples"],
+    drive: Curve | None,
+    first: Int[np.ndarray, " starts"],
+    n_substeps: int,
+    bound: Float[np.ndarray, " n_states"],
+) -> Float[np.ndarray, "starts n_states"]:
+    """Difference that twice as many substeps make from some samples to the next ones, in SI.
+
+    A chaotic run leaves its neighbours: single steps, not whole runs, are compared.
+    """
+    coarse, fine = (
+        _runs(field, starts, t, drive, first, 2, n, bound)[:, 1]
+        for n in (n_substeps, 2 * n_substeps)
+    )
+    return np.abs(coarse - fine)
+
+
+def _runs(
+    field: VectorField, starts: np.ndarray, t: np.ndarray, drive: Curve | None,
+    first: np.ndarray, n_samples: int, n_substeps: int, bound: np.ndarray,
+) -> np.ndarray:  # fmt: skip
+    steps = WindowSteps.along(t, drive, first, n_samples, n_substeps)
+    return run_many(field, starts[None], steps, centre=np.zeros(len(bound)), reach=bound)[0]
 
 
 def starts_around(states: np.ndarray, n_starts: int, spread: tuple[float, float]) -> np.ndarray:

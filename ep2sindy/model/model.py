@@ -14,15 +14,15 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 from scipy.special import ndtri
 
-from ep2sindy.data.coerce import check_domain, keep_inside, noise_inside
-from ep2sindy.data.runs import Run, is_run, trajectory_of
-from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.data.coerce import check_domain
+from ep2sindy.data.runs import Run, Runs, is_run, trajectories_of, trajectory_of
 from ep2sindy.library.equations import equation_text, equations_latex, sum_sympy
 from ep2sindy.library.library import Library
 from ep2sindy.library.units import SECONDS, Clock
 from ep2sindy.model.display import model_html, model_lines
 from ep2sindy.model.draws import draw_coef, draw_runs
 from ep2sindy.model.inputs import check_courses, curve_through, driven, inputs_at_samples
+from ep2sindy.model.restarts import one_step
 from ep2sindy.model.rollout import Rollout, check_start, integrate, simulate
 from ep2sindy.model.scores import r2
 from ep2sindy.model.storage import model_text, read_model, read_stored
@@ -30,7 +30,6 @@ from ep2sindy.model.vector_field import VectorField
 from ep2sindy.runtime.files import write_text
 from ep2sindy.runtime.screen import N_LINES
 from ep2sindy.runtime.values import check_count, read_only
-from ep2sindy.signals.smoothers import SavitzkyGolay, Smoother
 
 if TYPE_CHECKING:
     import sympy
@@ -352,23 +351,28 @@ class SparseModel:
 
     def score(
         self,
-        run: Run,
+        runs: Runs,
         *,
         x_dot: Float[np.ndarray, "samples n_states"] | None = None,
-        smoother: Smoother | None = None,
+        horizon_s: float | None = None,
     ) -> float:
-        """R2 of the derivative over a trajectory, averaged over the states; one is perfect.
+        """R2 of forecasts over one step, averaged over the states; one is exact.
+
+        From samples all over the runs the model is integrated over the step, and the change that
+        it foresees is compared with that of the samples: 1 - SS_res / SS_tot, with SS_tot about the
+        mean change. Zero is as good as that nothing changes. Noise in the samples keeps an exact
+        law from one: `ep.evaluate(model, runs).one_step` states what it allows.
 
         Parameters
         ----------
-        run : run
-            A run as `discover` takes it.
+        runs : run, or list or dict of runs
+            As `discover` takes them. Samples with missing states are left out.
         x_dot : (samples, n_states) array, optional
-            The true derivative in SI, in the order of the model's states; the right-hand side is
-            then evaluated at the raw samples. None takes the derivative and the samples from
-            `smoother`.
-        smoother : Smoother, optional
-            By default SavitzkyGolay(), as in `Differential`.
+            The derivative in SI, in the order of the model's states, of one run. The score is then
+            the mean R2 of the right-hand side at the samples against it.
+        horizon_s : float, optional
+            The step in s. None takes the fewest samples in which every state changes by ten times
+            its noise, one if there is none, or by its standard deviation.
 
         Returns
         -------
@@ -378,22 +382,21 @@ class SparseModel:
         Raises
         ------
         ValueError
-            If a variable is missing, a shape is wrong, a derivative is constant, or a sample lies
-            outside the domain of a function of the model.
+            If a variable is missing, a shape is wrong, a derivative is constant, or no sample of
+            all states is followed by such a step.
         """
-        run, library = trajectory_of(run), self.field.library
-        check_domain([run], library, smooth=x_dot is None)
-        values, shape = run.columns(library.variables), (run.n_samples, len(self.states))
+        found = trajectories_of(runs, partial=True)
         if x_dot is None:
-            values, truth = _smooth_samples(library, run, self.states, smoother or SavitzkyGolay())
-        else:
-            truth = np.asarray(x_dot, dtype=np.float64)
-            if truth.shape != shape:
-                raise ValueError(
-                    f"x_dot must have shape {shape}, a row per sample and a column for each of "
-                    f"{list(self.states)}, got {truth.shape}"
-                )
-        pairs = zip(truth.T, self.field.rates(values).T, strict=True)
+            return one_step(self, found, horizon_s=horizon_s).score
+        (run,), library, shape = found, self.field.library, (found[0].n_samples, len(self.states))
+        check_domain([run], library, smooth=False)
+        truth = np.asarray(x_dot, dtype=np.float64)
+        if truth.shape != shape:
+            raise ValueError(
+                f"x_dot must have shape {shape}, a row per sample and a column for each of "
+                f"{list(self.states)}, got {truth.shape}"
+            )
+        pairs = zip(truth.T, self.field.rates(run.columns(library.variables)).T, strict=True)
         return float(np.mean([r2(truth=y, prediction=p[None])[0] for y, p in pairs]))
 
     def text(self, *, digits: int = 3) -> str:
@@ -457,19 +460,6 @@ class SparseModel:
     def field(self) -> VectorField:
         """The right-hand side over the states, then the inputs, and its derivatives, in SI."""
         return VectorField.of(self.library, [*self.states, *self.inputs], self.coef)
-
-
-def _smooth_samples(
-    library: Library, run: Trajectory, states: Sequence[str], smoother: Smoother
-) -> tuple[Float[np.ndarray, "samples variables"], Float[np.ndarray, "samples n_states"]]:
-    """The library's variables, inside its domain, and the derivatives of the states."""
-    smooth, slopes = [], []
-    for each in run.segments():
-        samples = each.columns(library.variables)
-        inside = noise_inside(library, samples)
-        smooth.append(keep_inside(library, smoother.smooth(each.t, samples), inside))
-        slopes.append(smoother.derivative(each.t, each.columns(states)))
-    return np.concatenate(smooth), np.concatenate(slopes)
 
 
 def coef_matrix(

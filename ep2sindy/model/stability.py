@@ -42,6 +42,11 @@ MIN_STEPS, STEP_TIMES_RATE = 64, 1.0
 # over a number of periods between these.
 SHRUNK, LEAST_WAIT, MOST_WAIT = 3.0, 40.0, 400.0
 
+# Error of a multiplier by Newton's method; eigenvalues of a covariance below this fraction of the
+# largest are rounding. Periods and samples at the end of a long run, and its tolerance.
+EXACT, NO_DIRECTION = 1e-6, 1e-10
+N_END, N_SAMPLES_AT_END, LONG_RTOL = 20, 64, 1e-8
+
 # A run is given up as diverged when it is BLOW_UP times as far from the cycle's mean as the
 # farthest start, and as stuck after PATIENCE times the steps that the cycle itself takes.
 BLOW_UP, PATIENCE = 30.0, 4.0
@@ -76,6 +81,14 @@ class LimitCycle:
     def largest_multiplier(self) -> float:
         """Largest modulus of the multipliers other than that of the flow."""
         return float(np.abs(self.multipliers[1:]).max(initial=0.0))
+
+    @property
+    def relaxation_s(self) -> float:
+        """Time in s in which a perturbation shrinks e-fold; infinite if it does not."""
+        largest = self.largest_multiplier
+        if largest == 0.0:
+            return 0.0
+        return float(-self.period_s / np.log(largest)) if largest < 1.0 else float("inf")
 
     @property
     def stability(self) -> str:
@@ -231,6 +244,66 @@ def periods_to_reach(cycle: LimitCycle) -> float:
     if not 0.0 < largest < 1.0:
         return LEAST_WAIT
     return float(np.clip(-SHRUNK / np.log(largest), LEAST_WAIT, MOST_WAIT))
+
+
+def multiplier_error(cycle: LimitCycle) -> float:
+    """Standard error of the largest multiplier by the covariance of the coefficients.
+
+    It is that of Newton's method, 1e-6, for a model without covariance. Each direction in which the
+    coefficients are uncertain moves them by its standard deviation, and the multiplier with them;
+    one that leaves no closed orbit counts as moving it by one.
+    """
+    model = cycle.model
+    if model.covariance is None:
+        return EXACT
+    used = model.coef.T != 0.0
+    size = np.sqrt(np.maximum(np.diag(model.covariance), 0.0))
+    scale = np.where(size > 0.0, size, 1.0)
+    values, vectors = np.linalg.eigh(model.covariance / np.outer(scale, scale))
+    squares = EXACT**2
+    for value, vector in zip(values, vectors.T, strict=True):
+        if value <= NO_DIRECTION * values[-1]:
+            continue
+        coef = model.coef.T.copy()
+        coef[used] += np.sqrt(value) * vector * scale
+        moved = replace(model, coef=coef.T, covariance=None)
+        near = limit_cycle(moved, cycle.states[0], period_s=cycle.period_s)
+        change = 1.0 if near is None else near.largest_multiplier - cycle.largest_multiplier
+        squares += change**2
+    return float(np.sqrt(squares))
+
+
+def end_of_long_run(
+    model: SparseModel,
+    start: Float[np.ndarray, " n_states"],
+    duration_s: float,
+    period_s: float,
+) -> tuple[Float[np.ndarray, " samples"], Float[np.ndarray, "samples n_states"]] | None:
+    """Times and states at the end of a long run by LSODA; None if it diverges or gives up.
+
+    It goes on for twenty periods after the duration, with 64 samples in each. LSODA is another
+    solver than that of `SparseModel.rollout`, whose errors might keep a run on a cycle.
+    """
+    from scipy.integrate import solve_ivp
+
+    n = N_END * N_SAMPLES_AT_END
+    t = duration_s + period_s * np.arange(n) / N_SAMPLES_AT_END
+    scale = np.where(start == 0.0, 1.0, np.abs(start))
+    scaled = Driven(model.field.scaled(scale))
+    bound = BLOW_UP * np.sqrt(len(start))
+
+    def blown_up(_: float, y: np.ndarray) -> float:
+        return float(np.linalg.norm(y)) - bound
+
+    blown_up.terminal = True  # type: ignore[attr-defined]
+    with np.errstate(over="ignore", invalid="ignore"):
+        found = solve_ivp(
+            scaled, (0.0, t[-1]), start / scale, method="LSODA", t_eval=t, events=blown_up,
+            rtol=LONG_RTOL, atol=LONG_RTOL,
+        )  # fmt: skip
+    if not found.success or found.y.shape[1] < n or not np.isfinite(found.y).all():
+        return None
+    return t, found.y.T * scale
 
 
 def _on_cycle(

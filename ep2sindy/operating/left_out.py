@@ -11,7 +11,6 @@ from jaxtyping import Float
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.forecasting.evaluation import Evaluation, evaluate
 from ep2sindy.library.library import Library
-from ep2sindy.model.comparison import Status
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.stability import ATTRACTING_BELOW
 from ep2sindy.operating.law import read_law
@@ -111,7 +110,7 @@ def error_statistics(left_out: Sequence[LeftOutRun]) -> dict[str, float | int]:
     waveform = np.array([max(each.run.waveform_error.values()) for each in left_out])
     return {
         "n": len(left_out),
-        "n_sustained": sum(each.run.status is Status.SUSTAINED for each in left_out),
+        "n_sustained": sum(each.run.holds for each in left_out),
         "diverging": sum(each.run.rollout.diverged for each in left_out),
         "f_median": float(np.median(f)),
         "f_90": float(np.quantile(f, 0.9, method="higher")),

@@ -16,7 +16,6 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.forecasting.evaluation import Evaluation, evaluate
 from ep2sindy.model.comparison import (
     FreeRunBounds,
-    Status,
     columns_of,
     compare_cycles,
     densities_of,
@@ -44,6 +43,7 @@ from ep2sindy.selection.systems import (
     TrialSystem,
     combine,
     cut_segments,
+    describe_shared,
     find_sustained,
     folds,
     list_others,
@@ -210,7 +210,8 @@ class FreeRunScore:
         confirmed = self._confirm(ranked or by_error, measure, runs, progress)
         won = min(confirmed, key=lambda each: each.rank)
         scores = found.score(np.array([t.error for t in trials]), trials.index(won.trial))
-        note = f"{reason}{won.text(len(sustained), len(trials))}{found.left_out}"
+        shared = describe_shared(sustained) if won.run else ""
+        note = f"{reason}{won.text(len(sustained), len(trials))}{shared}{found.left_out}"
         others = list_others(sustained, won.trial) if won.run else ()
         return Decision(scores, won.model, note, won.trial.system.constraint, others)
 
@@ -404,7 +405,7 @@ class CycleRuns:
         run = evaluate(
             model, longest, initial=start, bounds=self.bounds, assessed=self.rule.assessed
         )
-        fraction, repels = _attraction(run) if run.status is Status.SUSTAINED else (0.0, False)
+        fraction, repels = _attraction(run) if run.comparison.stays else (0.0, False)
         return ConfirmedSystem(trial, model, trial.system.broken(model), fraction, run, repels)
 
 

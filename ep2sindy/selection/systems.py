@@ -15,7 +15,6 @@ from ep2sindy.forecasting.evaluation import Evaluation
 from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Constraint, Process, binding, constraint
 from ep2sindy.library.roles import process_amounts
-from ep2sindy.model.comparison import Status
 from ep2sindy.model.model import SparseModel, model_of
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.problem import RefinementChanges
@@ -342,6 +341,22 @@ def order_equals(ranked: Sequence[Trial]) -> list[Trial]:
     return found
 
 
+def describe_shared(sustained: Sequence[Trial]) -> str:
+    """What all self-sustained systems share, as the end of a note; empty for a single one.
+
+    What they do not share, the records do not determine.
+    """
+    if len(sustained) < 2:
+        return ""
+    first, *others = (trial.system.parts for trial in sustained)
+    shared = {
+        part: [term for term in terms if all(term in each.get(part, ()) for each in others)]
+        for part, terms in first.items()
+    }
+    known = [f"{part}: {', '.join(terms)}" for part, terms in shared.items() if terms]
+    return f"; all of these have {'; '.join(known)}" if known else "; these have no term in common"
+
+
 @dataclass(frozen=True, eq=False)
 class ConfirmedSystem:
     """A system refined on all data, and its free run over the longest record.
@@ -366,8 +381,8 @@ class ConfirmedSystem:
     @property
     def rests(self) -> bool:
         """Whether it is sustained on a neutral cycle."""
-        is_sustained = self.run is not None and self.run.status is Status.SUSTAINED
-        return is_sustained and not self.fraction and not self.repels
+        stays = self.run is not None and self.run.comparison.stays
+        return stays and not self.fraction and not self.repels
 
     def outdoes(self, resting: ConfirmedSystem) -> bool:
         """Whether an attracting system is preferred to one that is no larger, on a neutral cycle.
@@ -383,7 +398,7 @@ class ConfirmedSystem:
     @property
     def rank(self) -> tuple[float, ...]:
         """Sorts the best first; the first of equals wins."""
-        goes = (False, 0) if self.run is None else self.run.rank
+        goes = (False, 0) if self.run is None else self.run.comparison.rank
         size, fraction = self.trial.system.n_free, min(self.fraction, GLOBAL)
         attracts = (self.repels, not self.fraction, not self.is_global)
         return (bool(self.broken), *goes, *attracts, size, -fraction)
@@ -393,11 +408,11 @@ class ConfirmedSystem:
         if self.run is None:
             found = "chosen by windows held out"
         else:
-            how = self.run.text if n_sustained else f"{self.run.text} where fitted"
-            if self.run.status is Status.SUSTAINED and not self.fraction:
+            how = self.run.run_text + ("" if n_sustained else " where fitted")
+            if self.run.comparison.stays and not self.fraction:
                 how = f"{how}, on a cycle that {'repels' if self.repels else 'does not attract'}"
             elif self.fraction and not self.model.inputs:
-                how = f"{how}, {100.0 * self.fraction:.0f} % of starts reach it"
+                how = f"{how}, on a cycle that attracts"
             found = (
                 f"{how}; {n_sustained or 'none'} of {n_systems} systems are sustained "
                 "where not fitted"

@@ -44,6 +44,10 @@ PERIODS_TRACKED = 8.0
 
 N_SHIFTS = 720  # trial shifts of one waveform over another, before the best one is refined
 
+# Order of the differences that show white noise, the fewest samples for it, and the median of the
+# square of a normal number.
+N_DIFFERENCES, LEAST_FOR_NOISE, CHI_MEDIAN = 5, 12, 0.4549
+
 # Least ratio of the diagonal elements of a triangular factor that products of columns give to
 # twelve digits or more.
 WELL_CONDITIONED = 0.1
@@ -182,6 +186,27 @@ def _find_line(frequency: np.ndarray, power: np.ndarray) -> tuple[float, float]:
 def white_variance(frequency: Bins, power: Bins) -> float:
     """Variance of the white noise in a signal, from the upper half of its spectrum."""
     return float(noise_floor(power) * frequency[-1]) if len(power) else 0.0
+
+
+def noise_std(t: Samples, x: Samples) -> float:
+    """Standard deviation of the white noise in a signal, in its unit; zero for under 12 samples.
+
+    It is what fifth differences show, in the median, scaled so that they leave the size of white
+    noise as it is: at ten samples in a period, a sine leaves 0.6 % of its amplitude. At equal steps
+    it is at most what the upper half of the spectrum holds, whose median lines hardly change.
+    """
+    if len(t) < LEAST_FOR_NOISE:
+        return 0.0
+    n = len(t) - N_DIFFERENCES
+    places = np.arange(n)[:, None] + np.arange(N_DIFFERENCES + 1)
+    apart = t[places][:, :, None] - t[places][:, None]
+    apart /= t[places[:, -1:, None]] - t[places[:, :1, None]]
+    weights = 1.0 / np.prod(np.where(apart == 0.0, 1.0, apart), axis=2)
+    weights /= np.linalg.norm(weights, axis=1, keepdims=True)
+    shown = float(np.sqrt(np.median(np.square((weights * x[places]).sum(axis=1))) / CHI_MEDIAN))
+    if not is_uniform(t):
+        return shown
+    return min(shown, float(np.sqrt(white_variance(*power_spectrum(t, x)))))
 
 
 def mean_cycle(run: Trajectory) -> Trajectory:

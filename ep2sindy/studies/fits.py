@@ -279,7 +279,7 @@ class Study:
         best = best_run(runs)
         report.found(
             found_model(
-                f"Found by the fit {best}", runs[best], file=best, picture="trajectories",
+                best, runs[best], file=best, picture="trajectories",
                 more=[Text(f"the best of {len(fits)} fits")], where=where, seen=not self.held_out,
                 held=fits[best].first.held_to,
             )

@@ -16,7 +16,6 @@ from ep2sindy.forecasting.evaluation import Evaluation
 from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Constraint
 from ep2sindy.library.roles import Role
-from ep2sindy.model.comparison import Status
 from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.windows import dominant_window
 from ep2sindy.regression.constrained import constrained_fit, rows_r2
@@ -236,7 +235,7 @@ def ends(value: Callable[[Evaluation], float], runs: Sequence[Evaluation]) -> li
 
 
 def n_sustained(runs: Sequence[Evaluation]) -> int:
-    return sum(run.status is Status.SUSTAINED for run in runs)
+    return sum(run.holds for run in runs)
 
 
 def worst_amplitude(run: Evaluation) -> float:

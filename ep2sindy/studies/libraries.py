@@ -31,7 +31,7 @@ from ep2sindy.signals.attractor import find_cycle
 from ep2sindy.signals.averaging import average_long
 from ep2sindy.signals.driving import DRIVE, add_drive, ask_whether_driven, drop_repeats
 from ep2sindy.signals.signal import prepare_signal
-from ep2sindy.studies.balance import add_balance, model_balance
+from ep2sindy.studies.balance import ModelBalance, add_balance, model_balance
 from ep2sindy.studies.candidates import (
     add_candidates,
     add_estimate,
@@ -54,7 +54,12 @@ from ep2sindy.studies.source import (
     zones_of,
 )
 from ep2sindy.studies.study import Coefficients, Fraction, PositiveOrAll, Terms, ZeroOrMore
-from ep2sindy.studies.sustained import SustainedSearch, add_sustained, sustained_model
+from ep2sindy.studies.sustained import (
+    SustainedModel,
+    SustainedSearch,
+    add_sustained,
+    sustained_model,
+)
 from ep2sindy.studies.views import PlotRange, add_figures, add_samples
 from ep2sindy.trust.user_code import load_user_module
 
@@ -255,26 +260,21 @@ class Study:
         published = refitted_model(found, refitted)
         sustained = beside = None
         if self.sustained is not None and not found.model.inputs:
-            rows = Regression(self.formulation, bootstraps=self.bootstraps)
-            parts = split_in_time(runs[0], self.held_out or HELD_OUT)
-            sustained = sustained_model(
-                *parts, library, rows, self.sustained, zones, rng=rng,
-                progress=progress,
-            )  # fmt: skip
-            beside = model_balance(
-                sustained.model, sustained.discovery.constraint, runs[0], *parts, zones,
-                self.sustained.bounds, progress=progress,
-            )  # fmt: skip
+            sustained, beside = self._sustain(
+                self.sustained, runs[0], library, zones, rng=rng, progress=progress
+            )
         skill = skill_of(
             found.model if sustained is None else sustained.model, measured, starts=self.forecasts,
             n_fitted=self._n_fitted(measured), progress=progress,
         )  # fmt: skip
+        sustained = sustained and sustained.forecasting(skill)
         with progress.stage(None, "", "free runs"):
             pairs = zip(runs, n_samples, strict=True)
-            over = [partial(evaluate, run=run, n_samples=n) for run, n in pairs]
+            over = [partial(evaluate, runs=run, n_samples=n) for run, n in pairs]
+            own = skill if sustained is None else None
             return LibraryResult(
                 discovery=found,
-                runs=[run_over(found.model) for run_over in over],
+                runs=[replace(each(found.model), forecasts=lambda: own) for each in over],
                 thesis=thesis,
                 refitted=refitted,
                 published=None if published is None else over[0](published),
@@ -282,6 +282,20 @@ class Study:
                 balance=beside,
                 skill=skill,
             )
+
+    def _sustain(
+        self, settings: SustainedSearch, run: Trajectory, library: Library, zones: Zones, *,
+        rng: np.random.Generator, progress: Progress,
+    ) -> tuple[SustainedModel, ModelBalance]:  # fmt: skip
+        """The self-sustained model of a record, and the balance of its terms."""
+        rows = Regression(self.formulation, bootstraps=self.bootstraps)
+        parts = split_in_time(run, self.held_out or HELD_OUT)
+        found = sustained_model(*parts, library, rows, settings, zones, rng=rng, progress=progress)
+        held_to = found.discovery.constraint
+        beside = model_balance(
+            found.model, held_to, run, *parts, zones, settings.bounds, progress=progress
+        )
+        return found, beside
 
     def _tell(
         self,
@@ -298,7 +312,7 @@ class Study:
                 add_sustained(report, name, result.sustained)
                 add_balance(report, name, result.balance, data, result.sustained.run.cycle)
             if result.skill is not None:
-                where = "that it has seen" if result.sustained is None else "held out"
+                where = "seen by the search" if result.sustained is None else "held out"
                 title = f"{name}: forecasts over time {where}"
                 add_forecasts(report, name, data, result.skill, title=title)
         self._add_selected(report, data, results)

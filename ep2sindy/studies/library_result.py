@@ -141,11 +141,10 @@ def find_best(results: Mapping[str, LibraryResult], n_records: int) -> Result:
         best = best_run(runs)
         test = results[best].discovery.noise_test
         return found_model(
-            f"Found with the library {best}",
+            best,
             runs[best],
             file=best,
             picture="trajectories",
-            skill=results[best].skill,
             where=f"the worst of {n_records} records" if n_records > 1 else "the record",
             seen=True,
             lack_of_fit=test.lack_of_fit,
@@ -154,16 +153,14 @@ def find_best(results: Mapping[str, LibraryResult], n_records: int) -> Result:
         )
     best = best_run({name: each.run for name, each in sustained.items()})
     run = sustained[best].run
-    skill = results[best].skill
-    words = [Text(f"forecasts of held-out time: {skill.text}")] if skill is not None else []
-    caution = [Text(run.caution, warning=True)] if run.caution else []
+    note = [Text(f"{sustained[best].discovery.note}.")]
     tests = [result.discovery.noise_test for result in results.values()]
     return found_model(
-        f"Found with the library {best}",
+        best,
         run,
         file=f"{best}_sustained",
         picture="trajectories" if run.cycle is None else f"free_run_{best}",
-        more=[*words, *caution, *left_over_of_all(tests)],
+        more=[*note, *left_over_of_all(tests)],
         where="held-out time",
         held=sustained[best].discovery.constraint,
     )

@@ -10,7 +10,6 @@ import pandas as pd
 
 from ep2sindy.figures.sustained import sustained_figure
 from ep2sindy.forecasting.evaluation import Evaluation
-from ep2sindy.model.comparison import Status
 from ep2sindy.report.document import Result, Text
 from ep2sindy.report.models import equations
 from ep2sindy.report.report import Report
@@ -48,7 +47,7 @@ class AtPoints:
     @property
     def elsewhere(self) -> str:
         """What becomes of the model where it is not sustained, in words."""
-        words = [str(run.status) for run in self.runs if run.status is not Status.SUSTAINED]
+        words = [str(run.status) for run in self.runs if not run.holds]
         return ", ".join(f"{word} at {words.count(word)}" for word in dict.fromkeys(words))
 
     @property
@@ -122,7 +121,7 @@ def add_points(
     structures = {over[name].fits[0].name for name, n in counts.items() if n == len(found)}
     report.found(
         Result(
-            f"Found: {len(structures)} of {len(sources)} structures are sustained at all "
+            f"{len(structures)} of {len(sources)} structures are sustained at all "
             f"{len(found)} points",
             lines or [Text("none is sustained at any point")],
             load='pandas.read_csv("{}/tables/over_points.csv")',

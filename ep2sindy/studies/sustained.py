@@ -18,6 +18,7 @@ from ep2sindy.discovery.method import Regression
 from ep2sindy.discovery.result import Discovery
 from ep2sindy.figures import free_run as figures
 from ep2sindy.forecasting.evaluation import Evaluation, evaluate
+from ep2sindy.forecasting.skill import ForecastSkill
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.library.roles import Roles
 from ep2sindy.model.comparison import FreeRunBounds
@@ -150,6 +151,10 @@ class SustainedModel:
     @property
     def model(self) -> SparseModel:
         return self.discovery.model
+
+    def forecasting(self, skill: ForecastSkill | None) -> SustainedModel:
+        """The same, with the skill of its forecasts."""
+        return replace(self, run=replace(self.run, forecasts=lambda: skill))
 
 
 SUSTAINED_MODEL: Metrics[SustainedModel] = [

@@ -150,17 +150,16 @@ class Study:
         self._report_choice(signal, best, skill, report, linear=linear)
         seen = len(best.states.signal.t) == len(signal.t)
         where = "all of it, too short to hold out" if seen else "its end, which was not fitted"
-        data_warnings = [Text(free.caution, warning=True)] if free.caution else []
+        data_warnings = []
         is_sustained = free.status is Status.SUSTAINED and not question
         if is_sustained and (data_warning := report_unknown_drive(signal)):
             data_warnings.append(Text(data_warning))
         report.found(
             found_model(
-                f"Found from {signal.name}",
+                signal.name,
                 free,
                 file=NAME,
                 picture=f"free_run_{NAME}",
-                skill=skill,
                 more=data_warnings,
                 where=where,
                 seen=seen,

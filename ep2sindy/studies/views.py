@@ -12,11 +12,11 @@ import pandas as pd
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.figures import series
+from ep2sindy.forecasting.baselines import AUTOREGRESSION
 from ep2sindy.forecasting.evaluation import Evaluation, size_text
 from ep2sindy.forecasting.skill import ForecastSkill
 from ep2sindy.library.relations import Constraint
-from ep2sindy.model.comparison import Status
-from ep2sindy.report.document import Block, Result, Text
+from ep2sindy.report.document import Block, Result, Table, Text
 from ep2sindy.report.models import equations
 from ep2sindy.report.report import Report
 from ep2sindy.report.results import Metric, Metrics, View
@@ -105,7 +105,7 @@ def terms_text(terms: Mapping[str, Sequence[str]]) -> str:
 def best_run(runs: Mapping[str, Evaluation]) -> str:
     """Name of the run of the best status, and of these the nearest to the data."""
 
-    def rank(name: str) -> tuple[tuple[bool, int], float]:
+    def rank(name: str) -> tuple[int, float]:
         nrmse = runs[name].nrmse
         return runs[name].rank, nrmse if np.isfinite(nrmse) else np.inf
 
@@ -118,38 +118,38 @@ def worst_run(runs: Sequence[Evaluation]) -> Evaluation:
 
 
 def found_model(
-    found: str,
+    name: str,
     run: Evaluation,
     *,
     file: str,
     picture: str,
-    skill: ForecastSkill | None = None,
     more: Sequence[Block] = (),
     where: str,
     seen: bool = False,
     lack_of_fit: str = "",
     held: Constraint | None = None,
 ) -> Result:
-    """A model as what was found: what it foresees, its equations, and how it runs.
+    """A model as what was found: the verdict, its equations, and the figures behind the verdict.
 
-    found: how it was found, such as `Found from I_d`. file: its name among the run's models. skill:
-    of its forecasts, which are the headline; without them it is how the model runs. where: what it
-    was run over, in words, such as `held-out time`. seen: whether it was fitted to that. lack of
-    fit: why it does not explain the data, a warning; may be empty. held: that its coefficients
-    obey, if it was found under roles.
+    name: of what it was found from or by, a word. file: its name among the run's models. where:
+    what it was run over, in words, such as `held-out time`. seen: whether it was fitted to that.
+    lack of fit: why it does not explain the data, a warning; may be empty. held: that its
+    coefficients obey, if it was found under roles.
     """
-    clock, model = run.rollout.clock, run.model
-    fate = _fate(run, seen=seen, lack_of_fit=lack_of_fit)
-    free = run_words(run) if skill is None else f"{fate}; {run_words(run)}"
-    headline = f"a model that {fate}" if skill is None else skill.headline
-    freely = [f"run freely from one sample over {where}: {free}", *run.rest_texts]
-    if not model.coef.any():
-        headline, freely = "no law of any state", []
+    heading = f"{name}: {run.heading}"
+    if not run.model.coef.any():
+        return Result(heading, [*more], picture=picture)
+    fitted = ", where it was fitted" if seen else ""
+    rows = pd.DataFrame(run.table, columns=["", "data", "model"])
+    notes = [run.missing, *run.rest_texts]
     return Result(
-        f"{found}: {headline}",
+        heading,
         [
-            *equations(model, clock, held=held),
-            *map(Text, freely),
+            *equations(run.model, run.rollout.clock, held=held),
+            Text(f"run freely from one sample over {where}{fitted}: {run.text}"),
+            *([Table(rows)] if run.table else []),
+            *([] if run.forecast is None else [errors_table(run.forecast)]),
+            *(Text(note) for note in notes if note),
             *([Text(lack_of_fit, warning=True)] if lack_of_fit else []),
             *more,
         ],
@@ -158,23 +158,16 @@ def found_model(
     )
 
 
-def _fate(run: Evaluation, *, seen: bool, lack_of_fit: str) -> str:
-    """`sustains the oscillation`, `has the wrong cycle`, `diverges after 12 us`."""
-    words = {
-        Status.SUSTAINED: "keeps the oscillation under its inputs"
-        if run.model.inputs
-        else "sustains the oscillation",
-        Status.WRONG_FREQUENCY: "has the wrong frequency",
-        Status.WRONG_CYCLE: "has the wrong cycle",
-        Status.NO_CYCLE: "is unlike the data",
-    }
-    if not run.is_similar:
-        return words.get(run.status, run.text)
-    if run.status is Status.NO_CYCLE:
-        if lack_of_fit:
-            return "does not explain the data"
-        words[Status.NO_CYCLE] = "has the means and amplitudes of the data"
-    return f"{words[run.status]}{' where it was fitted' if seen else ''}"
+def errors_table(skill: ForecastSkill) -> Table:
+    """Errors of the model and of the baselines at a few horizons, in standard deviations."""
+    last = len(skill.horizons_s) - 1
+    places = sorted({round(k / 16 * last) for k in (0, 1, 2, 4, 8, 16)})
+    ahead = [f"{h / skill.unit_s:.2g}" for h in skill.horizons_s[places].tolist()]
+    names = dict.fromkeys([AUTOREGRESSION], f"AR({skill.order})")
+    columns = {names.get(name, name): each[places] for name, each in skill.nrmse.items()}
+    rows = pd.DataFrame({f"{skill.unit} ahead": ahead, **columns})
+    title = "errors of forecasts, in standard deviations of the samples (1: the mean)"
+    return Table(rows, title=title, note=skill.nearest_text)
 
 
 def frequency_words(run: Evaluation, form: str = "+.1f") -> str:
@@ -187,24 +180,6 @@ def frequency_words(run: Evaluation, form: str = "+.1f") -> str:
         return "-"
     error = f" ({100 * run.f_error:{form}} %)" if np.isfinite(run.f_error) else ""
     return f"{run.rollout.clock.frequency_text(frequency_Hz)}{error}"
-
-
-def run_words(run: Evaluation) -> str:
-    """Frequency, amplitude and waveform of a run next to the data's, as far as they are known."""
-    found = []
-    if (frequency := frequency_words(run, "+.2g")) != "-":
-        found.append(f"frequency {frequency}")
-    ratios = [value for value in run.amplitude_ratio.values() if np.isfinite(value)]
-    if ratios:
-        ends = dict.fromkeys(size_text(value) for value in (min(ratios), max(ratios)))
-        found.append(f"amplitude {' to '.join(ends)} times the data's")
-    waveforms = [value for value in run.waveform_error.values() if np.isfinite(value)]
-    if waveforms:
-        found.append(f"waveform within {max(waveforms):.2g} standard deviations")
-    found += filter(None, [run.phase_text])
-    if not found and np.isfinite(run.nrmse):
-        found.append(f"{size_text(run.nrmse, '.2g')} standard deviations off")
-    return "; ".join(found) or run.text
 
 
 def _size(ratio: float) -> str:
@@ -225,6 +200,7 @@ EVALUATION: Metrics[Evaluation] = [
     Metric("amplitude_ratio", lambda run: run.amplitude_ratio, View.ALL, "amplitude {}", _size),
     Metric("waveform_error", lambda run: run.waveform_error, View.ALL, "waveform {}", "{:.3f}"),
     Metric("nrmse", lambda run: run.nrmse, View.ALL, format=_size),
+    Metric("distance", lambda run: run.distance),
     Metric("periods", lambda run: run.periods, View.SHOWN, "periods in phase", "{:.0f}"),
     Metric("status", lambda run: run.text, View.SHOWN),
 ]
