@@ -5,8 +5,8 @@ finds them: over operating points, splits of the record and seeds, on the defaul
 former one, and on `thruster=lif`, whose ions flow back (`lif_law`, `lif_law_back`, and with 200
 cells `lif_law_back_fine`); in two zones at once (`several`), in noise, and from the (z, r)
 simulator. Every model called self-sustained is run again by another solver, ten times as long; its
-processes are compared with the balance of the zone. Prints the tables of docs/living.md, or those
-that are named.
+processes are compared with the balance of the zone. `growth`: how far equal models of one record
+differ where they rest. Prints the tables of docs/living.md, or those that are named.
 """
 
 from __future__ import annotations
@@ -360,6 +360,43 @@ def print_law(roles: ep.Roles, name: str = "default") -> None:
             print(f"    {each.run.text}: {off}, waveform {each.waveform:.3f}")
 
 
+def models_of_its_size(whole: Record) -> list[ep.model.Evaluation]:
+    """Free runs of every sustained model that has as many free coefficients as the selected one.
+
+    The others are refined as the selected one is, on the first three quarters of the record.
+    """
+    fitted, assessed = parts(whole.run, "last")
+    found = conserving(fitted, whole, seed=0)
+    models = [found.model]
+    for other in found.others:
+        exchange, outflow = [], {}
+        for role, terms in other.terms.items():
+            giver, _, taker = role.partition(" to ")
+            if taker:
+                exchange.append((giver, taker, list(terms)))
+            else:
+                outflow[giver.removesuffix(" out")] = list(terms)
+        roles = replace(MASS_ACTION, exchange=exchange, outflow=outflow)
+        models.append(law(fitted, whole, seed=0, roles=roles).model)
+    runs = [ep.evaluate(each, assessed, initial=start_of(assessed, each)) for each in models]
+    return [run for run in runs if run.status is ep.model.Status.SUSTAINED]
+
+
+def print_growth() -> None:
+    """Six operating points: where the models of one size rest, and what they say of growth."""
+    print("\nsustained models of the selected one's size: growth and frequency where they rest")
+    for label in POINTS:
+        rests = [run.rest for run in models_of_its_size(record(label))]
+        growth, f_kHz = np.transpose(
+            [(rest.growth_per_s, 1e-3 * rest.frequency_Hz) for rest in rests if rest is not None]
+        )
+        print(
+            f"{label}: {len(growth)} of {len(rests)} rest; growth {growth.min():.0f} to "
+            f"{growth.max():.0f} 1/s, small oscillation {f_kHz.min():.1f} to {f_kHz.max():.1f} kHz",
+            flush=True,
+        )
+
+
 def print_several(draws: Sequence[tuple[str, int]], name: str = "default") -> None:
     """Six operating points, the channel cut into two zones of equal length."""
     print(f"\n{name} source, two zones: median / worst of {len(draws)} draws")
@@ -420,6 +457,7 @@ def main() -> None:
         "points": print_points,
         "law": lambda: print_law(LAW),
         "law_stated": lambda: print_law(LAW_STATED),
+        "growth": print_growth,
         "former": lambda: print_points("former", ONCE),
         "lif_law": lambda: print_law(LAW, "lif"),
         "lif_law_back": lambda: print_law(LAW_BACK, "lif"),
