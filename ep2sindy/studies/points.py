@@ -403,7 +403,6 @@ def points_table(results: Sequence[PointResult], records: Records) -> pd.DataFra
             "f_kHz": 1e-3 * (record.cycle.frequency_Hz if record else result.f_Hz),
             "n_samples": result.n_samples,
             "dt_s": result.dt_s,
-            **{f"spread_{state}": value for state, value in result.spread.items()},
         }
         rows.append(row | {"relative_amplitude": record.relative_amplitude if record else np.nan})
     return pd.DataFrame(rows)
