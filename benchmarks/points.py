@@ -10,8 +10,8 @@ equations are right: of one search over all points, of one regression with share
 of every point alone; then the errors of the coefficients.
 `grid`: the package's own discharge at 290 to 370 V and 4 to 5.5 mg/s, five by five, 6 ms each,
 densities averaged over the channel. Every point is left out in turn of quadratic laws, for the
-models of conf/exp/predict.yaml and some next to them; then the law of the study's choice at points
-drawn between.
+models of conf/exp/predict.yaml and some next to them, and next to interpolation without a model;
+then the law of the study's choice at points drawn between.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ from ep2sindy.operating.given_models import (
     fit_models,
     fits_of,
 )
-from ep2sindy.operating.law import constrain_law, make_basis
-from ep2sindy.operating.left_out import LawTrial, run_left_out
-from ep2sindy.operating.records import OperatingRecord, read_points
+from ep2sindy.operating.law import constrain_law
+from ep2sindy.operating.left_out import LawTrial, error_statistics, run_left_out
+from ep2sindy.operating.records import OperatingRecord
 from ep2sindy.runtime.parallel import Loky, Workers
 
 # The thesis's six operating points (Table IV): V and mg/s.
@@ -192,18 +192,6 @@ def line(name: str, runs: Sequence[Evaluation]) -> str:
     )
 
 
-def interpolate(records: Sequence[OperatingRecord]) -> None:
-    """The measured frequencies and amplitudes themselves, by as many functions as a law has."""
-    basis = make_basis(QUADRATIC, read_points([r.parameters for r in records], NAMES), n_spare=1)
-    own = np.array([(r.cycle.frequency_Hz, *r.cycle.std) for r in records])
-    off = np.abs(basis.predict_left_out(own) / own - 1.0)
-    f, amplitude = off[:, 0], off[:, 1:].max(axis=1)
-    print(
-        f"the records' own: f {np.median(f):.2%}, 9 in 10 "
-        f"{np.quantile(f, 0.9, method='higher'):.2%}; amplitude {np.median(amplitude):.1%}"
-    )
-
-
 def left_out(
     name: str, given: GivenModel, results: Sequence[PointResult], records: Sequence[OperatingRecord]
 ) -> None:
@@ -211,15 +199,21 @@ def left_out(
     for end in ("", REFINED):
         fits = fits_of(name + end, given, results)
         trial = LawTrial(name + end, fits, QUADRATIC, np.zeros(0))
-        runs = [each.run for each in run_left_out(trial, records)]
-        print(f"{line(name + end, runs)}; {fits.n_free} free")
+        runs = run_left_out(trial, records)
+        print(f"{line(name + end, [each.run for each in runs])}; {fits.n_free} free")
+        same = error_statistics(runs)
+        print(
+            f"    at the {same['n_enclosed']} that the others enclose: f {same['f_enclosed']:.3%}, "
+            f"amplitude {same['amplitude_enclosed']:.1%}; no model: f "
+            f"{same['f_interpolated']:.3%}, amplitude {same['amplitude_interpolated']:.1%}",
+            flush=True,
+        )
 
 
 def grid() -> None:
     workers = Loky()
     runs = all_recorded(list(product(VOLTAGES, FLOWS)), workers)
     records = [OperatingRecord(run) for run in runs]
-    interpolate(records)
     given = {
         name: GivenModel(
             constrain_law(

@@ -232,8 +232,10 @@ class Study:
         points = points_table(results, records)
         if law is not None:
             if law.at_points:
-                points["law"] = [str(point.status) for point in law.at_points]
-            of_law = add_law(report, law, points, self.labels)
+                points["law"] = law.outcomes
+            searched = "terms of another degree (++degree=...)"
+            remedy = "other models or models=null" if self.models else searched
+            of_law = add_law(report, law, points, self.labels, remedy=remedy)
             found = replace(found, blocks=[*found.blocks, Text(law.text)]) if found else of_law
         assert found is not None
         report.found(found)
