@@ -40,7 +40,7 @@ from ep2sindy.operating.given_models import (
 )
 from ep2sindy.operating.law import constrain_law
 from ep2sindy.operating.left_out import LawTrial, error_statistics, run_left_out
-from ep2sindy.operating.records import OperatingRecord
+from ep2sindy.operating.records import OperatingRecord, read_points
 from ep2sindy.runtime.parallel import Loky, Workers
 
 # The thesis's six operating points (Table IV): V and mg/s.
@@ -192,6 +192,20 @@ def line(name: str, runs: Sequence[Evaluation]) -> str:
     )
 
 
+def interpolated(known: Sequence[OperatingRecord], others: Sequence[OperatingRecord]) -> str:
+    """Errors at other points of what is fitted to the cycles of known ones, without a model."""
+    theta, wanted = (
+        QUADRATIC.evaluate(read_points([r.parameters for r in records], NAMES))
+        for records in (known, others)
+    )
+    own, true = (
+        np.array([(r.cycle.frequency_Hz, *r.cycle.std) for r in records])
+        for records in (known, others)
+    )
+    off = np.abs(wanted @ np.linalg.lstsq(theta, own, rcond=None)[0] / true - 1.0)
+    return f"f {np.median(off[:, 0]):.3%}; amplitude {np.median(off[:, 1:].max(axis=1)):.1%}"
+
+
 def left_out(
     name: str, given: GivenModel, results: Sequence[PointResult], records: Sequence[OperatingRecord]
 ) -> None:
@@ -230,6 +244,7 @@ def grid() -> None:
     rng = np.random.default_rng(1)
     drawn = rng.uniform((VOLTAGES[0], FLOWS[0]), (VOLTAGES[-1], FLOWS[-1]), (N_BETWEEN, 2))
     between = all_recorded([(round(v, 1), round(m, 2)) for v, m in drawn], workers)
+    print(f"between, no model: {interpolated(records, [OperatingRecord(run) for run in between])}")
     for end in ("", REFINED):
         law = fits_of(CHOICE + end, given[CHOICE], results).law(QUADRATIC)
         free = [ep.evaluate(law.at(extrapolate=False, **run.parameters), run) for run in between]

@@ -191,7 +191,7 @@ def test_a_search_that_fails_is_not_told_to_search(tmp_path: Path) -> None:
         table.assign(p=table["p"] ** 3).to_csv(path)
     found = programs.computed(composed(*records, "models=null", "+degree=1"))
     (warning,) = [each for each in found.warnings if "of 3 points left out" in each]
-    assert "terms of another degree" in warning
+    assert "or another ++degree=" in warning
     assert "models=null" not in warning
     assert "Nothing found: found_" in found.log
 

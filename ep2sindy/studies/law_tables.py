@@ -226,12 +226,7 @@ def _leave_out(
 
 
 def add_law(
-    report: Report,
-    found: FoundLaw,
-    points: pd.DataFrame,
-    labels: Mapping[str, str],
-    *,
-    remedy: str,
+    report: Report, found: FoundLaw, points: pd.DataFrame, labels: Mapping[str, str], remedy: str
 ) -> Result:
     """Add the law, how it does at points left out, where it oscillates, and what was tried.
 

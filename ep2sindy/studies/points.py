@@ -233,9 +233,8 @@ class Study:
         if law is not None:
             if law.at_points:
                 points["law"] = law.outcomes
-            searched = "terms of another degree (++degree=...)"
-            remedy = "other models or models=null" if self.models else searched
-            of_law = add_law(report, law, points, self.labels, remedy=remedy)
+            others = "other models or models=null" if self.models else "another ++degree=..."
+            of_law = add_law(report, law, points, self.labels, others)
             found = replace(found, blocks=[*found.blocks, Text(law.text)]) if found else of_law
         assert found is not None
         report.found(found)
