@@ -5,7 +5,7 @@
 The current of the package's thruster, 6 ms at four voltages and three mass flows, with white noise
 in fractions of its mean, is written as files, and `+exp=predict` is run over them as a user would:
 it makes a second state, searches its equation over all records, and chooses at points left out.
-Prints the equation, and how the models of the others run there.
+Prints the equation, and how the models of the others run there, next to interpolation.
 """
 
 import argparse
@@ -56,7 +56,10 @@ def measure(folder: Path) -> str:
     return (
         f"{chosen['terms']} by {chosen['functions']}; {errors['n_sustained']} of {errors['n']} "
         f"sustained, frequency {errors['f_median']:.2%} in the median, {errors['f_90']:.2%} for "
-        f"nine in ten, amplitude {errors['amplitude_median']:.1%}"
+        f"nine in ten, amplitude {errors['amplitude_median']:.1%}; at the {errors['n_enclosed']} "
+        f"that the others enclose: frequency {errors['f_enclosed']:.3%}, amplitude "
+        f"{errors['amplitude_enclosed']:.1%}; interpolated without a model: "
+        f"{errors['f_interpolated']:.3%}, {errors['amplitude_interpolated']:.1%}"
     )
 
 

@@ -9,7 +9,9 @@ in n_n. The Jacobian of the logarithms has
     determinant  nu_i nu_n (q r - p u) - nu_i s (p - r)     squares of frequency and growth, added
 
 Prints, for every operating point, growth and frequency of the law's rest point, and what theories
-in zero dimensions say of the averages of the same record: the table of docs/theories.md.
+in zero dimensions say of the averages of the same record, next to the law's: small oscillations are
+compared with small ones, the cycle is large. `python -m benchmarks.sustained growth` prints how far
+equal models of one record differ. Both make the table of docs/theories.md.
 """
 
 from __future__ import annotations
@@ -121,23 +123,30 @@ def theories(whole: sustained.Record, crossing: float) -> dict[str, Balance]:
     return found
 
 
-def row(name: str, found: complex) -> str:
+def row(name: str, found: complex, law: complex) -> str:
     growth, frequency = found.real, abs(found.imag) / (2e3 * np.pi)
-    return f"    {name:18s} growth {growth:7.0f} 1/s, {frequency:5.1f} kHz"
+    return (
+        f"    {name:18s} growth {growth:7.0f} 1/s, {frequency:5.1f} kHz; of the law's: growth "
+        f"{growth / law.real:6.2f}, frequency {abs(found.imag / law.imag):.3f}"
+    )
 
 
 def main() -> None:
     """Print all points of the default source."""
     for label in sustained.POINTS:
         whole = sustained.record(label)
-        print(f"\n{label}: cycle {sustained.field(label).attrs['f_kHz']:.1f} kHz")
         turning, balance = law_at_rest(whole)
-        print(row("law, Jacobian", turning))
-        print(row("law, closed form", balance.eigenvalue))
+        cycle = ep.signals.find_cycle(whole.run.t, whole.run.states)
+        assert cycle is not None
+        ratio = abs(turning.imag) / (2.0 * np.pi * cycle.frequency_Hz)
+        cycle_kHz = 1e-3 * cycle.frequency_Hz
+        print(f"\n{label}: cycle {cycle_kHz:.2f} kHz; law at rest {ratio:.3f} of it")
+        print(row("law, Jacobian", turning, turning))
+        print(row("law, closed form", balance.eigenvalue, turning))
         speed = float(sustained.POINTS[label].neutral_speed_at(np.zeros(1))[0])
         crossing = speed / ep.thruster.Thruster().channel_length
         for theory, balance in theories(whole, crossing).items():
-            print(row(theory, balance.eigenvalue), flush=True)
+            print(row(theory, balance.eigenvalue, turning), flush=True)
 
 
 if __name__ == "__main__":

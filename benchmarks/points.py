@@ -10,8 +10,8 @@ equations are right: of one search over all points, of one regression with share
 of every point alone; then the errors of the coefficients.
 `grid`: the package's own discharge at 290 to 370 V and 4 to 5.5 mg/s, five by five, 6 ms each,
 densities averaged over the channel. Every point is left out in turn of quadratic laws, for the
-models of conf/exp/predict.yaml and some next to them; then the law of the study's choice at points
-drawn between.
+models of conf/exp/predict.yaml and some next to them, and next to interpolation without a model;
+then the law of the study's choice at points drawn between.
 """
 
 from __future__ import annotations
@@ -29,7 +29,6 @@ import yaml
 
 import ep2sindy as ep
 from ep2sindy.forecasting.evaluation import Evaluation
-from ep2sindy.model.comparison import Status
 from ep2sindy.operating.given_models import (
     REFINED,
     FittingSettings,
@@ -38,8 +37,8 @@ from ep2sindy.operating.given_models import (
     fit_models,
     fits_of,
 )
-from ep2sindy.operating.law import constrain_law, make_basis
-from ep2sindy.operating.left_out import LawTrial, run_left_out
+from ep2sindy.operating.law import constrain_law
+from ep2sindy.operating.left_out import LawTrial, error_statistics, run_left_out
 from ep2sindy.operating.records import OperatingRecord, read_points
 from ep2sindy.runtime.parallel import Loky, Workers
 
@@ -184,7 +183,7 @@ def line(name: str, runs: Sequence[Evaluation]) -> str:
     f[np.isnan(f)] = np.inf
     amplitude = [max(abs(v - 1.0) for v in run.amplitude_ratio.values()) for run in runs]
     waveform = [max(run.waveform_error.values()) for run in runs]
-    sustained = sum(run.status is Status.SUSTAINED for run in runs)
+    sustained = sum(run.holds for run in runs)
     return (
         f"{name:<22} {sustained} of {len(runs)} live; f {np.median(f):.2%}, 9 in 10 "
         f"{np.quantile(f, 0.9, method='higher'):.2%}, at most {f.max():.2%}; amplitude "
@@ -192,16 +191,18 @@ def line(name: str, runs: Sequence[Evaluation]) -> str:
     )
 
 
-def interpolate(records: Sequence[OperatingRecord]) -> None:
-    """The measured frequencies and amplitudes themselves, by as many functions as a law has."""
-    basis = make_basis(QUADRATIC, read_points([r.parameters for r in records], NAMES), n_spare=1)
-    own = np.array([(r.cycle.frequency_Hz, *r.cycle.std) for r in records])
-    off = np.abs(basis.predict_left_out(own) / own - 1.0)
-    f, amplitude = off[:, 0], off[:, 1:].max(axis=1)
-    print(
-        f"the records' own: f {np.median(f):.2%}, 9 in 10 "
-        f"{np.quantile(f, 0.9, method='higher'):.2%}; amplitude {np.median(amplitude):.1%}"
+def interpolated(known: Sequence[OperatingRecord], others: Sequence[OperatingRecord]) -> str:
+    """Errors at other points of what is fitted to the cycles of known ones, without a model."""
+    theta, wanted = (
+        QUADRATIC.evaluate(read_points([r.parameters for r in records], NAMES))
+        for records in (known, others)
     )
+    own, true = (
+        np.array([(r.cycle.frequency_Hz, *r.cycle.std) for r in records])
+        for records in (known, others)
+    )
+    off = np.abs(wanted @ np.linalg.lstsq(theta, own, rcond=None)[0] / true - 1.0)
+    return f"f {np.median(off[:, 0]):.3%}; amplitude {np.median(off[:, 1:].max(axis=1)):.1%}"
 
 
 def left_out(
@@ -211,15 +212,21 @@ def left_out(
     for end in ("", REFINED):
         fits = fits_of(name + end, given, results)
         trial = LawTrial(name + end, fits, QUADRATIC, np.zeros(0))
-        runs = [each.run for each in run_left_out(trial, records)]
-        print(f"{line(name + end, runs)}; {fits.n_free} free")
+        runs = run_left_out(trial, records)
+        print(f"{line(name + end, [each.run for each in runs])}; {fits.n_free} free")
+        same = error_statistics(runs)
+        print(
+            f"    at the {same['n_enclosed']} that the others enclose: f {same['f_enclosed']:.3%}, "
+            f"amplitude {same['amplitude_enclosed']:.1%}; no model: f "
+            f"{same['f_interpolated']:.3%}, amplitude {same['amplitude_interpolated']:.1%}",
+            flush=True,
+        )
 
 
 def grid() -> None:
     workers = Loky()
     runs = all_recorded(list(product(VOLTAGES, FLOWS)), workers)
     records = [OperatingRecord(run) for run in runs]
-    interpolate(records)
     given = {
         name: GivenModel(
             constrain_law(
@@ -236,6 +243,7 @@ def grid() -> None:
     rng = np.random.default_rng(1)
     drawn = rng.uniform((VOLTAGES[0], FLOWS[0]), (VOLTAGES[-1], FLOWS[-1]), (N_BETWEEN, 2))
     between = all_recorded([(round(v, 1), round(m, 2)) for v, m in drawn], workers)
+    print(f"between, no model: {interpolated(records, [OperatingRecord(run) for run in between])}")
     for end in ("", REFINED):
         law = fits_of(CHOICE + end, given[CHOICE], results).law(QUADRATIC)
         free = [ep.evaluate(law.at(extrapolate=False, **run.parameters), run) for run in between]

@@ -5,8 +5,8 @@ finds them: over operating points, splits of the record and seeds, on the defaul
 former one, and on `thruster=lif`, whose ions flow back (`lif_law`, `lif_law_back`, and with 200
 cells `lif_law_back_fine`); in two zones at once (`several`), in noise, and from the (z, r)
 simulator. Every model called self-sustained is run again by another solver, ten times as long; its
-processes are compared with the balance of the zone. Prints the tables of docs/living.md, or those
-that are named.
+processes are compared with the balance of the zone. `growth`: how far equal models of one record
+differ where they rest. Prints the tables of docs/living.md, or those that are named.
 """
 
 from __future__ import annotations
@@ -245,10 +245,10 @@ def case(
     cpu_s, model = time.process_time() - begun, found.model
     run = ep.evaluate(model, assessed, initial=start_of(assessed, model))
     multiplier = fraction = float("nan")
-    if run.status is ep.model.Status.SUSTAINED and (cycle := run.cycle) is not None:
+    if run.holds and (cycle := run.cycle) is not None:
         multiplier = float(np.abs(cycle.multipliers[1:]).max())
         fraction = run.basin_stability
-    confirmed = run.status is not ep.model.Status.SUSTAINED or lives_on(model, assessed)
+    confirmed = not run.holds or lives_on(model, assessed)
     held = found.constraint
     n_free = int(np.count_nonzero(model.coef)) if held is None else len(held.free)
     processes = {p.name: (p.ratio, p.r2) for p in whole.processes(model, held)}
@@ -281,7 +281,7 @@ def parts(run: ep.Trajectory, split: str) -> tuple[ep.Trajectory, ep.Trajectory]
 
 def line(name: str, cases: Sequence[Case]) -> str:
     """How many live, and the median and the worst of each figure of those that have it."""
-    sustained = [each for each in cases if each.run.status is ep.model.Status.SUSTAINED]
+    sustained = [each for each in cases if each.run.holds]
     wrong = sum(not each.confirmed for each in cases)
     if not sustained:
         return f"{name:24s} 0 of {len(cases)} live: {[c.run.text for c in cases][:3]}"
@@ -295,7 +295,7 @@ def line(name: str, cases: Sequence[Case]) -> str:
     fractions = [c.fraction for c in sustained]
     cpu_s = np.median([c.cpu_s for c in cases])
     lost = Counter(
-        each.run.text for each in cases if each.run.status is not ep.model.Status.SUSTAINED
+        each.run.text for each in cases if not each.run.holds
     )
     return (
         f"{name:24s} {len(sustained)} of {len(cases)} live ({wrong} refuted); f {f} %; amplitude "
@@ -355,9 +355,46 @@ def print_law(roles: ep.Roles, name: str = "default") -> None:
             ratios.append([p.coef[term] / p.counterpart[term] for p in compared for term in p.coef])
         medians = ", ".join(f"{ratio:.2f}" for ratio in np.median(ratios, axis=0))
         print("\n".join([line(label, cases), balances(cases), f"    {medians}"]), flush=True)
-        for each in (c for c in cases if c.run.status is not ep.model.Status.SUSTAINED):
+        for each in (c for c in cases if not c.run.holds):
             off = f"f {each.run.f_error:+.2%}, amplitude {each.amplitude:.1%}"
             print(f"    {each.run.text}: {off}, waveform {each.waveform:.3f}")
+
+
+def models_of_its_size(whole: Record) -> list[ep.model.Evaluation]:
+    """Free runs of every sustained model that has as many free coefficients as the selected one.
+
+    The others are refined as the selected one is, on the first three quarters of the record.
+    """
+    fitted, assessed = parts(whole.run, "last")
+    found = conserving(fitted, whole, seed=0)
+    models = [found.model]
+    for other in found.others:
+        exchange, outflow = [], {}
+        for role, terms in other.terms.items():
+            giver, _, taker = role.partition(" to ")
+            if taker:
+                exchange.append((giver, taker, list(terms)))
+            else:
+                outflow[giver.removesuffix(" out")] = list(terms)
+        roles = replace(MASS_ACTION, exchange=exchange, outflow=outflow)
+        models.append(law(fitted, whole, seed=0, roles=roles).model)
+    runs = [ep.evaluate(each, assessed, initial=start_of(assessed, each)) for each in models]
+    return [run for run in runs if run.holds]
+
+
+def print_growth() -> None:
+    """Six operating points: where the models of one size rest, and what they say of growth."""
+    print("\nsustained models of the selected one's size: growth and frequency where they rest")
+    for label in POINTS:
+        rests = [run.rest for run in models_of_its_size(record(label))]
+        growth, f_kHz = np.transpose(
+            [(rest.growth_per_s, 1e-3 * rest.frequency_Hz) for rest in rests if rest is not None]
+        )
+        print(
+            f"{label}: {len(growth)} of {len(rests)} rest; growth {growth.min():.0f} to "
+            f"{growth.max():.0f} 1/s, small oscillation {f_kHz.min():.1f} to {f_kHz.max():.1f} kHz",
+            flush=True,
+        )
 
 
 def print_several(draws: Sequence[tuple[str, int]], name: str = "default") -> None:
@@ -420,6 +457,7 @@ def main() -> None:
         "points": print_points,
         "law": lambda: print_law(LAW),
         "law_stated": lambda: print_law(LAW_STATED),
+        "growth": print_growth,
         "former": lambda: print_points("former", ONCE),
         "lif_law": lambda: print_law(LAW, "lif"),
         "lif_law_back": lambda: print_law(LAW_BACK, "lif"),

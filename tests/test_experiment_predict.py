@@ -3,12 +3,14 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+import xarray as xr
 from omegaconf import DictConfig
 
 from benchmarks import known_laws
 from ep2sindy.app import runner
 from ep2sindy.app.runner import run_config
 from ep2sindy.app.schema import study_of
+from ep2sindy.data.open import write_field
 from ep2sindy.operating.law import OperatingLaw
 from ep2sindy.operating.map import map_points
 from ep2sindy.studies import points as studied
@@ -63,8 +65,10 @@ def test_the_run_leaves_a_law_tables_figures_and_a_summary(folder: Path) -> None
     assert headline["n_sustained"] == (tables["left_out"]["status"] == "sustained").sum()
     assert headline["window_error"] == pytest.approx(chosen["error"])
     points = tables["points"]
-    right = (points["status"] == "oscillating") == (points["law"] == "sustained")
-    assert headline["map_right"] == right.mean()
+    oscillating = points["status"] == "oscillating"
+    assert headline["n_fitted_sustained"] == (points["law"][oscillating] == "sustained").sum()
+    assert points["law"][oscillating].tolist().count("wrong cycle") == 2  # cycles, of another size
+    assert headline["n_rests"] == 0
     alone = tables["coefficients"].set_index(["model", "state", "term"])["coef"]
     both = tables["law_coefficients"].set_index(["V_D_V", "mdot_mg_s", "state", "term"])
     at = (*points.loc[1, ["V_D_V", "mdot_mg_s"]], "n_i", "n_n")
@@ -162,6 +166,36 @@ def test_without_a_model_the_terms_are_searched_for(tmp_path: Path) -> None:
     assert {state: set(own) for state, own in terms.items()} == {
         "n_i": {"n_i", "n_n", "n_i^3"}, "n_n": {"n_i"},
     }  # fmt: skip
+
+
+def test_what_rests_is_counted_apart_and_what_went_out_is_not(tmp_path: Path) -> None:
+    settings = own_records(tmp_path, 0.6, 0.9, 1.2, -0.4, 0.7)
+    out = xr.Dataset.from_dataframe(pd.read_csv(tmp_path / "0.7.csv", index_col="time"))
+    out["p"].attrs["units"] = out["q"].attrs["units"] = "m^-3"
+    write_field(out.assign_attrs(status="out"), tmp_path / "out.nc")
+    settings = [each.replace(f"{tmp_path}/0.7.csv", f"{tmp_path}/out.nc") for each in settings]
+    found = programs.computed(composed(*settings))
+    points = found.report.tables["points"].set_index("a")
+    assert points["status"].tolist()[3:] == ["decaying", "out"]
+    *held, rests = points["law"].tolist()[:4]
+    assert all(word.startswith("follows the samples for") for word in held)
+    assert rests == "rests"
+    numbers = found.report.headline
+    assert [numbers[f"n_{k}"] for k in ("points", "fitted_sustained", "rests")] == [5, 3, 1]
+    says = "sustains 3 of the 3 it was fitted to, and rests at 1 of 1 whose record is steady or"
+    assert f"{says} decays; not counted: out." in " ".join(found.log.split())
+
+
+def test_a_search_that_fails_is_not_told_to_search(tmp_path: Path) -> None:
+    records = own_records(tmp_path, 0.6, 0.9, 1.2)
+    for path in tmp_path.glob("*.csv"):  # pulses, which no linear model has
+        table = pd.read_csv(path, index_col="time")
+        table.assign(p=table["p"] ** 3).to_csv(path)
+    found = programs.computed(composed(*records, "models=null", "+degree=1"))
+    (warning,) = [each for each in found.warnings if "of 3 points left out" in each]
+    assert "or another ++degree=" in warning
+    assert "models=null" not in warning
+    assert "Nothing found: found_" in found.log
 
 
 def test_of_two_cycles_the_law_is_that_of_the_one_with_most_records(tmp_path: Path) -> None:

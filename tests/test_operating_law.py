@@ -21,6 +21,7 @@ from ep2sindy.operating.point_fits import PointFits, fit_rows, fit_trajectories
 from ep2sindy.operating.records import OperatingRecord, branches_of
 from ep2sindy.regression.pooled import Basis, fewest_of_least, invert_covariance
 from ep2sindy.regression.rows import RegressionRows
+from ep2sindy.studies.law_tables import FoundLaw
 from tests.models import plain_rows
 
 STATES = ("x", "y")
@@ -227,12 +228,48 @@ def test_points_left_out_live_by_the_law_of_the_others() -> None:
     assert numbers["f_90"] < 5e-3
 
 
+def test_interpolation_is_that_of_the_other_points_where_they_enclose_one() -> None:
+    found = run_left_out(trial(), records())
+    own = np.array([(r.cycle.frequency_Hz, *r.cycle.std) for r in records()])
+    values = LINEAR.evaluate(np.array([[*point.values()] for point in GRID]))
+    for k, each in enumerate(found):
+        errors = tuple(each.interpolated.values())
+        if not each.inside:
+            assert np.isnan(errors).all()
+            continue
+        fit = np.linalg.lstsq(np.delete(values, k, 0), np.delete(own, k, 0), rcond=None)[0]
+        off = np.abs(values[k] @ fit / own[k] - 1.0)
+        assert errors == pytest.approx((off[0], off[1:].max()), rel=1e-6)
+    numbers, inside = error_statistics(found), [each for each in found if each.inside]
+    assert numbers["n_enclosed"] == 5
+    own = [each.interpolated["frequency"] for each in inside]
+    assert numbers["f_interpolated"] == np.median(own)
+    assert numbers["f_enclosed"] == np.median([abs(each.run.f_error) for each in inside])
+
+
+def gone(left_out: LeftOutRun) -> LeftOutRun:
+    """The same point, at which the run diverges."""
+    run = left_out.run
+    lost = replace(run.comparison, status=Status.DIVERGES, is_similar=False, f_error=float("nan"))
+    rollout = replace(run.rollout, diverged=True)
+    return replace(left_out, run=replace(run, comparison=lost, rollout=rollout))
+
+
+def test_what_has_no_frequency_is_said_in_words() -> None:
+    runs = run_left_out(trial(), records())
+    for n_gone, words in ((2, "(2 of 9 have no frequency)"), (5, ". 5 of 9 have no frequency.")):
+        lost = [gone(each) for each in runs[:n_gone]]
+        tried = replace(trial(), errors=np.ones(9))
+        found = FoundLaw(
+            "all", records(), [tried], tried, law(), [*lost, *runs[n_gone:]], [], [], []
+        )
+        assert words in found.text
+        assert " -" not in found.text
+
+
 def test_a_point_without_a_frequency_has_an_infinite_error_of_it() -> None:
     found = run_left_out(trial(), records())
-    diverged = replace(found[0].run.comparison, status=Status.DIVERGES, f_error=float("nan"))
-    rollout = replace(found[0].run.rollout, diverged=True)
-    gone = replace(found[0].run, comparison=diverged, rollout=rollout)
-    numbers = error_statistics([LeftOutRun(records()[0], gone, inside=True), *found[1:]])
+    numbers = error_statistics([gone(found[0]), *found[1:]])
     assert numbers["n_sustained"] == 8
     assert numbers["f_90"] == np.inf
     assert numbers["f_median"] < 5e-3

@@ -10,6 +10,7 @@ from ep2sindy.model.comparison import Status
 from ep2sindy.model.fixed_point import rest_point
 from ep2sindy.operating.map import law_map
 from ep2sindy.operating.records import OperatingRecord
+from ep2sindy.signals.spectrum import relative_amplitude
 from tests.models import model_of
 from tests.test_operating_law import recorded
 from tests.test_stability import HOPF
@@ -52,6 +53,32 @@ def test_a_cycle_begins_where_the_fixed_point_turns_unstable() -> None:
         expected = np.exp(-4.0 * np.pi * point.parameters["a"])
         assert point.second == pytest.approx(expected, rel=1e-3, abs=1e-6)
     assert np.isnan(found[0].frequency_Hz)
+    assert np.isnan(found[3].relative_amplitude)  # both states swing around zero
+
+
+@pytest.mark.parametrize(
+    ("mean", "std", "expected"),
+    [
+        ([2.0, 1.0], [1.0, 1.0], (0.625**0.5)),
+        ([2.0, 1e-11], [1.0, 1.0], 0.5),  # a current, and its growth rate
+        ([1e-3], [1.0], np.nan),
+        ([0.0, -4.0], [0.0, 1.0], 32.0**-0.5),
+    ],
+)
+def test_an_amplitude_is_no_ratio_to_a_mean_of_zero(
+    mean: list[float], std: list[float], expected: float
+) -> None:
+    found = relative_amplitude(np.array(mean), np.array(std))
+    assert found == pytest.approx(expected, nan_ok=True)
+
+
+def test_the_amplitude_of_a_signal_and_its_growth_rate_is_that_of_the_signal() -> None:
+    t = 0.01 * np.arange(6000)
+    signal = np.exp(np.sin(t))
+    states = np.column_stack([signal, np.cos(t)])
+    record = OperatingRecord(ep.Trajectory(t, states, ["I", "g"], parameters={"a": 1.0}))
+    expected = record.cycle.std[0] / record.cycle.mean[0]
+    assert record.relative_amplitude == pytest.approx(expected)
 
 
 def test_a_law_of_some_parameters_is_mapped_at_points_of_more() -> None:

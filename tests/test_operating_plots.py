@@ -95,6 +95,13 @@ def test_a_map_is_faded_beyond_the_fitted_points_and_white_without_a_cycle() -> 
     np.testing.assert_array_equal(shown.mask, rows["status"] == "decays")
 
 
+def test_signals_around_zero_have_a_map_of_their_frequency_alone() -> None:
+    points = POINTS.assign(relative_amplitude=np.nan)
+    figure = cycle_figure(grid(5), points, branch="strong", parameters=["a", "b"], labels={})
+    drawn(figure)
+    assert [ax.get_ylabel() for ax in figure.axes] == ["$b$", "frequency (kHz)"]
+
+
 def example_law(n: int, parameters: Sequence[str]) -> tuple[OperatingLaw, pd.DataFrame]:
     """A law of n coefficients, and its table with values of points alone a tenth higher."""
     names = ["x", "x^2", LONG, f"x*{LONG}", "x*n_i", "n_i*n_n"] * 2

@@ -159,6 +159,19 @@ def test_the_table_holds_medians_and_spread_of_each_regime() -> None:
     }
 
 
+@pytest.mark.parametrize("has_one_sign", [True, False])
+def test_a_term_of_little_weight_that_all_points_hold_is_in_the_equation(
+    has_one_sign: bool,
+) -> None:
+    coef, weight = (np.array(patched()[name].values) for name in ("coef", "weight"))
+    coef[0, 0], weight[0, 0] = 0.1, 0.05
+    if not has_one_sign:
+        coef[0, 0] *= (-1.0) ** np.indices((4, 3)).sum(axis=0)
+    found = found_in(patched(coef=coef, weight=weight, weight_draws=np.stack([weight] * 2)))
+    expected = {"x", "y"} if has_one_sign else {"y"}
+    assert [set(found.equations(k)["x"]) for k in range(found.n_regimes)] == [expected] * 2
+
+
 def test_the_largest_regime_comes_first() -> None:
     weight = np.array(patched()["weight"].values)
     weight[0, 1, 1] = -1.0

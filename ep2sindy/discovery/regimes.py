@@ -36,6 +36,8 @@ UNSURE = 0.5  # confidence below which a point counts as unsure
 
 LEAST = 0.1  # fraction of an equation from which a term acts
 
+EVERYWHERE = 0.9  # of a regime's points: a term that as many hold, with one sign, acts all the same
+
 RESOLUTION = 0.2  # least width of a regime, in activities of terms
 
 
@@ -47,7 +49,8 @@ class Regimes:
     equations. confidence: same shape, mean probability of the point's regime over the bootstraps;
     NaN where labels are -1.
     table: one row per regime, equation and term. acts: True if the median of |weight| reaches
-    LEAST. in_support: fraction of the regime's points whose support holds the term. weight: the
+    LEAST, or if in_support reaches EVERYWHERE and coef_low and coef_high have one sign.
+    in_support: fraction of the regime's points whose support holds the term. weight: the
     median. coef, coef_low and coef_high: median, 16 % and 84 % of the points that hold the term, in
     the unit of the column coef_units. n_points, confidence (mean) and unsure (fraction of the
     points whose confidence is below UNSURE) are those of the regime. at_limit: True if there are as
@@ -216,14 +219,16 @@ def _table(
             for k, term in enumerate(result["term"].values):
                 values = coef[inside, e, k]
                 low, middle, high = spread(values)
+                weight, held = weights[inside, e, k], np.count_nonzero(values) / inside.sum()
+                everywhere = held >= EVERYWHERE and low * high > 0.0
                 rows.append(
                     {
                         "regime": regime,
                         "equation": str(equation),
                         "term": str(term),
-                        "acts": bool(np.median(np.abs(weights[inside, e, k])) >= LEAST),
-                        "in_support": np.count_nonzero(values) / inside.sum(),
-                        "weight": float(np.median(weights[inside, e, k])),
+                        "acts": bool(everywhere or np.median(np.abs(weight)) >= LEAST),
+                        "in_support": held,
+                        "weight": float(np.median(weight)),
                         "coef": middle,
                         "coef_low": low,
                         "coef_high": high,

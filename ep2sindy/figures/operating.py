@@ -150,15 +150,19 @@ def cycle_figure(
 
     A map over two parameters, a line over one, both faded where the law is extrapolated. rows: a
     grid of `MapPoint.row`, whose second parameter varies fastest. points: parameters, branch (empty
-    for points that do not oscillate), f_kHz and relative_amplitude of the records.
+    for points that do not oscillate), f_kHz and relative_amplitude of the records. Amplitudes are
+    left out if all are unknown, as of signals that swing around zero.
     """
     names, own = list(parameters), points["branch"] == branch
     factor, unit = frequency_scale(points["f_kHz"][own])
     rows, points = (table.assign(f_kHz=factor * table["f_kHz"]) for table in (rows, points))
+    quantities = {"f_kHz": f"frequency ({unit})", "relative_amplitude": "relative amplitude"}
+    if points["relative_amplitude"][own].isna().all():
+        del quantities["relative_amplitude"]
     kinds = _sort_points(rows, points.fillna({"relative_amplitude": 0.0}), own.to_numpy(), names)
     is_map = len(names) == 2
-    figure, (axes,) = style.make_panels(1, 2, (WIDTH, 4.0), sharex=True, sharey=is_map)
-    quantities = {"f_kHz": f"frequency ({unit})", "relative_amplitude": "relative amplitude"}
+    size = (WIDTH, 4.0)
+    figure, (axes,) = style.make_panels(1, len(quantities), size, sharex=True, sharey=is_map)
     for ax, (quantity, title) in zip(axes, quantities.items(), strict=True):
         colours = ScalarMappable(_colour_range(rows[quantity], points[quantity][own]))
         ax.set_xlabel(style.name_label(names[0], labels))

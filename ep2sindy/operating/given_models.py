@@ -27,7 +27,6 @@ from ep2sindy.signals.spectrum import (
     Oscillation,
     dominant_frequency,
     oscillation,
-    relative_spread,
     samples_in_periods,
 )
 
@@ -92,8 +91,8 @@ class FittedModel:
 class PointResult:
     """Results at one operating point; without fits unless its status is "oscillating".
 
-    f_Hz: dominant frequency of the first state. spread: for each state, standard deviation over
-    mean. fits: by the name of the model, and of the model + "_refined".
+    f_Hz: dominant frequency of the first state. fits: by the name of the model, and of the model +
+    "_refined".
     """
 
     parameters: Point
@@ -101,7 +100,6 @@ class PointResult:
     n_samples: int = 0
     dt_s: float = float("nan")
     f_Hz: float = float("nan")
-    spread: Mapping[str, float] = field(default_factory=dict)
     fits: Mapping[str, FittedModel] = field(default_factory=dict)
 
     def is_usable(self, fit: str) -> bool:
@@ -152,7 +150,6 @@ def _fit_point(
             n_samples=run.n_samples,
             dt_s=run.dt_s,
             f_Hz=dominant_frequency(run.t, run.states[:, 0]),
-            spread=dict(zip(run.state_names, relative_spread(run.states).tolist(), strict=True)),
         )
         if result.status != Oscillation.OSCILLATING:
             return result

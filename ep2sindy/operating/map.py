@@ -23,7 +23,9 @@ from ep2sindy.signals.spectrum import SIMULATED, relative_amplitude
 # a hundred periods.
 NEUTRAL = 0.01
 
-STILL = SIMULATED.spread  # of the mean: a smaller spread is no cycle (the simulator's "steady")
+# A smaller spread is no cycle (the simulator's "steady"): a fraction of the mean, or of the
+# record's standard deviation if that is larger, as of a state that swings around zero.
+STILL = SIMULATED.spread
 
 N_PERIODS = 40  # length of a run, in which it may settle
 
@@ -38,7 +40,7 @@ class MapPoint:
     inside: True in the hull of the records. status: of a run that starts near the cycle of the
     nearest record: sustained, decays to a fixed point, or diverges.
     frequency_Hz, relative_amplitude: of its cycle (standard deviation over mean, root mean square
-    over the states); NaN without a cycle.
+    over the states that do not swing around zero); NaN without a cycle.
     growth_per_s: largest real part of the fixed point's eigenvalues, in 1/s, positive if it is
     unstable; NaN if there is no fixed point near. second: modulus of the second Floquet multiplier;
     NaN without a cycle.
@@ -98,7 +100,7 @@ def _map_point(law: OperatingLaw, record: OperatingRecord, point: Point) -> MapP
     period_s = 1.0 / record.cycle.frequency_Hz
     start = record.run.states[record.slowest]
     mean, frequency_Hz, amplitude, second = record.cycle.mean, np.nan, np.nan, np.nan
-    status, late = _run(model, start, period_s, np.abs(record.run.states).max(axis=0))
+    status, late = _run(model, start, record)
     if status is Status.SUSTAINED:
         cycle = limit_cycle(model, late, period_s=period_s)
         if cycle is None or cycle.stability == "repelling":
@@ -108,7 +110,7 @@ def _map_point(law: OperatingLaw, record: OperatingRecord, point: Point) -> MapP
             frequency_Hz = 1.0 / cycle.period_s
             amplitude = relative_amplitude(mean, cycle.states.std(axis=0))
             second = cycle.largest_multiplier
-            status = Status.SUSTAINED if amplitude >= STILL else Status.DECAYS
+            status = Status.SUSTAINED if _moves(cycle.states, record) else Status.DECAYS
     elif status is Status.DECAYS:
         mean = late
     rest = rest_point(model, mean, record.cycle.std, record.run.states.min(axis=0) > 0.0)
@@ -128,17 +130,18 @@ def _map_point(law: OperatingLaw, record: OperatingRecord, point: Point) -> MapP
 
 
 def _run(
-    model: SparseModel,
-    start: Float[np.ndarray, " n_states"],
-    period_s: float,
-    reach: Float[np.ndarray, " n_states"],
+    model: SparseModel, start: Float[np.ndarray, " n_states"], record: OperatingRecord
 ) -> tuple[Status, Float[np.ndarray, " n_states"]]:
-    """Status of a run from a start, and its final state. reach: largest states of the record."""
-    n = 50
-    t = np.linspace(0.0, N_PERIODS * period_s, N_PERIODS * n + 1)
+    """Status of a run from a start, next to the record, and its final state."""
+    n, reach = 50, np.abs(record.run.states).max(axis=0)
+    t = np.linspace(0.0, N_PERIODS / record.cycle.frequency_Hz, N_PERIODS * n + 1)
     run = simulate(model, t, start, None, blow_up=1e3, rtol=1e-7, reach=reach)
     if run.diverged or not np.isfinite(run.states).all():
         return Status.DIVERGES, start
-    late = run.states[-5 * n :]
-    amplitude = relative_amplitude(late.mean(axis=0), late.std(axis=0))
-    return (Status.SUSTAINED if amplitude >= STILL else Status.DECAYS), run.states[-1]
+    moves = _moves(run.states[-5 * n :], record)
+    return (Status.SUSTAINED if moves else Status.DECAYS), run.states[-1]
+
+
+def _moves(states: Float[np.ndarray, "samples n_states"], record: OperatingRecord) -> bool:
+    size = np.maximum(np.abs(states.mean(axis=0)), zero_to_one(record.cycle.std))
+    return float(np.square(states.std(axis=0) / size).mean()) >= STILL**2

@@ -75,7 +75,7 @@ class OperatingRecord:
 
     @property
     def relative_amplitude(self) -> float:
-        """Standard deviation over mean of the waveform, root mean square over the states."""
+        """Standard deviation over mean of the waveform: see `spectrum.relative_amplitude`."""
         return relative_amplitude(self.cycle.mean, self.cycle.std)
 
     @property

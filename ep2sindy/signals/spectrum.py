@@ -20,6 +20,10 @@ from ep2sindy.data.numbers import rounding_s, zero_to_one
 
 STEP_TOLERANCE = 1e-6  # largest relative spread of steps in uniform sampling
 
+# Least mean, in standard deviations, by which an amplitude is divided. That of a growth rate or a
+# derivative is zero but for noise; a train of pulses has a hundredth of its time at this mean.
+LEAST_MEAN = 0.1
+
 PEAK_WIDTH = 0.05  # half-width of a peak, as a fraction of its frequency; two bins at least
 
 DECAYED = 0.1  # a run has decayed if its late spread is below this fraction of the data's
@@ -182,7 +186,8 @@ class Oscillation(StrEnum):
     Either `oscillating`, or the reason why the record does not count as such. steady: it hardly
     varies. decaying: it varied much more before. no dominant frequency: its spectrum has no peak,
     or it is too short. transit: it oscillates faster than the mode of interest. no period: it
-    oscillates without repeating a waveform. diverged: the run ended early.
+    oscillates without repeating a waveform. diverged: the run ended early. out: a discharge that
+    has gone out.
     """
 
     OSCILLATING = "oscillating"
@@ -192,6 +197,7 @@ class Oscillation(StrEnum):
     TRANSIT = "transit"
     NO_PERIOD = "no period"
     DIVERGED = "diverged"
+    OUT = "out"
 
 
 @dataclass(frozen=True)
@@ -224,7 +230,7 @@ SIMULATED = OscillationBounds(spread=0.02, lasting=0.7, n_blocks=4)
 def oscillation(t: Samples, states: States, bounds: OscillationBounds = RECORDED) -> Oscillation:
     """Classify a record by the first bound that it violates; `oscillating` if it violates none."""
     blocks = np.array_split(states, bounds.n_blocks)
-    if (relative_spread(blocks[-1]) < bounds.spread).any():
+    if (over_mean(blocks[-1].mean(axis=0), blocks[-1].std(axis=0)) < bounds.spread).any():
         return Oscillation.STEADY
     if has_decayed(blocks[-1], blocks[0], bounds.lasting).any():
         return Oscillation.DECAYING
@@ -239,11 +245,6 @@ def oscillation(t: Samples, states: States, bounds: OscillationBounds = RECORDED
     return Oscillation.TRANSIT if peak_Hz > bounds.max_Hz else Oscillation.OSCILLATING
 
 
-def relative_spread(states: States) -> ByState:
-    """Standard deviation of every state divided by the absolute value of its mean."""
-    return states.std(axis=0) / np.maximum(np.abs(states.mean(axis=0)), np.finfo(float).tiny)
-
-
 def has_decayed(
     states: States, earlier: Float[np.ndarray, "_ n_states"], fraction: float
 ) -> Bool[np.ndarray, " n_states"]:
@@ -252,6 +253,14 @@ def has_decayed(
     return below
 
 
+def over_mean(mean: ByState, std: ByState) -> ByState:
+    """Standard deviation over absolute mean of every state; NaN of one that swings around zero."""
+    size = np.abs(mean)
+    return np.where(size < LEAST_MEAN * std, np.nan, std / zero_to_one(size))
+
+
 def relative_amplitude(mean: ByState, std: ByState) -> float:
-    """Root mean square over the states of standard deviation divided by absolute mean."""
-    return float(np.sqrt(np.square(std / zero_to_one(np.abs(mean))).mean()))
+    """Root mean square of `over_mean` over the states that have it; NaN if none has."""
+    ratio = over_mean(mean, std)
+    known = ratio[~np.isnan(ratio)]
+    return float(np.sqrt(np.square(known).mean())) if known.size else float("nan")

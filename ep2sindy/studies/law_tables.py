@@ -5,12 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from math import isfinite
 
 import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
+from ep2sindy.data.trajectory import point_label
 from ep2sindy.figures.operating import cycle_figure, laws_figure
+from ep2sindy.forecasting.evaluation import Evaluation, evaluate
 from ep2sindy.model.comparison import Status
 from ep2sindy.operating.law import LawFunctions, OperatingLaw, read_law
 from ep2sindy.operating.left_out import (
@@ -43,7 +46,9 @@ LEFT_OUT = (
     "Each point in turn read off the law of the others, and run freely from one sample of its "
     "record, where the states move least. Errors are those against the record's cycle; a model "
     "sustained, within 1 % of frequency, 10 % of amplitude and 0.2 standard "
-    "deviations of waveform; enclosed: whether the others enclose it."
+    "deviations of waveform; enclosed: whether the others enclose it. Interpolated: errors of "
+    "frequency and amplitude without a model, by the functions of the law fitted to those of the "
+    "other records; of enclosed points."
 )
 TRIED = (
     "error: mean over the points left out, by the law of the others, of what windows of the record "
@@ -58,13 +63,17 @@ CAPTIONS = {
     "five values of the other parameters. Where the open points leave the lines by more than their "
     "bars, other coefficients make up for it: points are sloppy in some directions, and those "
     "count little.",
-    "map": "Frequency and relative amplitude (standard deviation over mean) of the law's cycle "
-    "over the operating parameters, none where it rests, and of the records (circles); "
-    "crosses: points that do not oscillate; diamonds: records of another cycle, not fitted here. "
-    "Red: the law says otherwise than the record. Black line on a map: where the law's cycle ends; "
-    "dashed: where its fixed point turns stable. Faded: beyond what the points that the law was "
-    "fitted to enclose, where it is extrapolated.",
+    "map": "Frequency and relative amplitude (standard deviation over mean, of states that do not "
+    "swing around zero) of the law's cycle over the operating parameters, none where it rests, and "
+    "of the records (circles); crosses: points that do not oscillate; diamonds: records of another "
+    "cycle, not fitted here. Red: the law oscillates where the record does not, or the reverse. "
+    "Black line on a map: where the law's cycle ends; dashed: where its fixed point turns stable, "
+    "of which cycles alone tell little. Faded: beyond what the points that the law was fitted to "
+    "enclose, where it is extrapolated.",
 }
+# What a law's model does at a point without a record of its cycle.
+ALONE = {Status.SUSTAINED: "oscillates", Status.DECAYS: "rests", Status.DIVERGES: "diverges"}
+QUIET = (Oscillation.STEADY, Oscillation.DECAYING)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,8 +81,9 @@ class FoundLaw:
     """The law of the records on one cycle, and what was tried for it.
 
     cycle: its name; "all" if there is only one. runs: of the points left out, each with the law of
-    the others. at_points: the law's models at all points of the study. map: the same over a grid
-    that encloses these. Of a model that inputs drive, which has no free runs, all three are empty.
+    the others. fitted: of the law of all points over each record. at_points: its models at all
+    points of the study. map: the same over a grid that encloses these. Of a model that inputs
+    drive, which has no free runs, all four are empty.
     """
 
     cycle: str
@@ -82,6 +92,7 @@ class FoundLaw:
     choice: LawTrial
     law: OperatingLaw
     runs: Sequence[LeftOutRun]
+    fitted: Sequence[Evaluation]
     at_points: Sequence[MapPoint]
     map: Sequence[MapPoint]
 
@@ -98,21 +109,44 @@ class FoundLaw:
         return {trial.name: float(trial.errors.mean()) for trial in self.trials}
 
     @property
+    def outcomes(self) -> list[str]:
+        """By point of the study: the law next to the record of its cycle, or by itself."""
+        runs = {point_label(run.record.parameters): run.text for run in self.fitted}
+        return [runs.get(point_label(p.parameters), ALONE[p.status]) for p in self.at_points]
+
+    @property
     def text(self) -> str:
         """How the law does at the points left out."""
-        found, text = self.statistics, percent(2)
+        found, text = self.statistics, percent(3)
         windows = (
             "Left out one at a time, windows of the records are followed to "
             f"{found['window_error']:.3g} standard deviations"
         )
         if not self.runs:
             return f"{windows}."
-        return (
+        lost = f"{found['n'] - found['n_cycles']} of {found['n']} have no frequency"
+        said = (
             f"{windows}, and run freely {found['n_sustained']} of {found['n']} points are "
-            "sustained, diverging: "
-            f"{found['diverging']}. Errors in the median: frequency {text(found['f_median'])} "
-            f"(nine in ten within {text(found['f_90'])}), the worst state's amplitude "
-            f"{text(found['amplitude_median'])} and waveform {places(found['waveform_median'], 3)}."
+            f"sustained, diverging: {found['diverging']}. "
+        )
+        if not isfinite(found["f_median"]):
+            return f"{said}{lost}."
+        spread = f"nine in ten within {text(found['f_90'])}" if isfinite(found["f_90"]) else lost
+        said += (
+            f"Errors in the median: frequency {text(found['f_median'])} ({spread}), the worst "
+            f"state's amplitude {text(found['amplitude_median'])} and waveform "
+            f"{places(found['waveform_median'], 3)}. "
+        )
+        if not found["n_enclosed"]:
+            return f"{said}No point is enclosed by the others, so that none can be interpolated."
+        law, between = (
+            f"by {text(found[f'f_{kind}'])} in frequency and {text(found[f'amplitude_{kind}'])} in "
+            "amplitude"
+            for kind in ("enclosed", "interpolated")
+        )
+        return (
+            f"{said}At the {found['n_enclosed']} that the others enclose it errs {law}; "
+            f"interpolation between the other records, without a model, {between}."
         )
 
 
@@ -152,15 +186,16 @@ def find_law(
     errors = np.array(collect(workers, one, list(enumerate(records)), stage))
     trials = [replace(t, errors=own) for t, own in zip(trials, errors.T, strict=True)]
     best, runs = _choose(trials, records)
-    law = best.fits.law(best.functions)
+    law, fitted = best.fits.law(best.functions), []
     at, maps = [*points, *(map_points(points, n_map) if n_map else [])], []
     if runs:
+        fitted = [evaluate(read_law(law, r.parameters), r.from_slowest) for r in records]
         pieces = [at[first : first + N_TOGETHER] for first in range(0, len(at), N_TOGETHER)]
         stage = report.progress(len(at), "point", "map of the law")
         maps = collect(workers, partial(law_map, law, records), pieces, stage, size=len)
     known = [point for piece in maps for point in piece]
     n = len(points)
-    return FoundLaw(cycle, records, trials, best, law, runs, known[:n], known[n:])
+    return FoundLaw(cycle, records, trials, best, law, runs, fitted, known[:n], known[n:])
 
 
 def _choose(
@@ -191,17 +226,18 @@ def _leave_out(
 
 
 def add_law(
-    report: Report, found: FoundLaw, points: pd.DataFrame, labels: Mapping[str, str]
+    report: Report, found: FoundLaw, points: pd.DataFrame, labels: Mapping[str, str], remedy: str
 ) -> Result:
     """Add the law, how it does at points left out, where it oscillates, and what was tried.
 
-    points: status, cycle, frequency and amplitude of every point. Returns what was found, in short.
+    points: status, cycle, frequency and amplitude of every point, and what the law does there.
+    remedy: another choice of terms, to try if the law fails. Returns what was found, in short.
     """
     law, choice, parameters = found.law, found.choice, list(found.records[0].parameters)
     exact = list(choice.fits.relations.texts)
     report.write("law.json", law.save)
     report.summary["law"] = {"fit": choice.name, "cycle": found.cycle, "exact": exact}
-    report.headline |= {"map_right": np.nan, **found.statistics}
+    report.headline |= found.statistics
     report.section(
         f"Law of {choice.name}",
         *(f"exact at every point: {each}" for each in exact),
@@ -216,11 +252,11 @@ def add_law(
     shown = [Text(found.text)]
     head = f"Found: a law of {choice.name} over {', '.join(law.parameters)}"
     if found.runs:
-        head += (
-            f", by which {found.statistics['n_sustained']} of {len(found.runs)} points left out "
-            "are sustained"
-        )
-        _add_left_out(report, found)
+        n, n_sustained = len(found.runs), found.statistics["n_sustained"]
+        head = f"Found: a law of {choice.name}; {n_sustained} of {n} left-out points sustained"
+        if not n_sustained:
+            head = f"Nothing found: {choice.name} sustains none of {n} left-out points"
+        _add_left_out(report, found, remedy)
         shown.append(Text(_add_map(report, found, points, labels)))
     report.section("Structures and laws compared")
     bold = [k for k, trial in enumerate(found.trials) if trial is choice]
@@ -276,20 +312,21 @@ def _coefficients(found: FoundLaw) -> pd.DataFrame:
     return at.merge(both, left_index=True, right_on="model").drop(columns="model")
 
 
-def _add_left_out(report: Report, found: FoundLaw) -> None:
+def _add_left_out(report: Report, found: FoundLaw, remedy: str) -> None:
     metrics: list[Metric[LeftOutRun]] = [
         *map(_parameter, found.records[0].parameters),
         Metric("enclosed", lambda p: p.inside, View.SHOWN),
         Metric("f_kHz", lambda p: 1e-3 * p.record.cycle.frequency_Hz),
         *(metric.of(lambda p: p.run, view=View.SHOWN) for metric in EVALUATION),
+        Metric("interpolated", lambda p: p.interpolated, View.SHOWN, "interpolated {}", percent(3)),
     ]
     report.section("Prediction of points left out")
     report.table("left_out", ResultTable(found.runs, metrics), note=LEFT_OUT)
     if not found.statistics["n_sustained"]:
         report.warn(
-            f"none of {len(found.runs)} points left out is sustained by the law of the others, so "
-            "it predicts none between them: try points that lie closer together, other models, or "
-            "models=null, longer records, and inputs that are states (docs/points.md)"
+            f"none of {len(found.runs)} points left out is sustained by the law of the others: do "
+            "not trust it at a point without a record; try points that lie closer together, longer "
+            f"records, or {remedy} (docs/points.md)"
         )
 
 
@@ -300,10 +337,7 @@ def _parameter(name: str) -> Metric[LeftOutRun]:
 def _add_map(
     report: Report, found: FoundLaw, points: pd.DataFrame, labels: Mapping[str, str]
 ) -> str:
-    """Add the map, if there is one; returns at how many points the law is right."""
-    says = np.array([point.status is Status.SUSTAINED for point in found.at_points])
-    does = (points["status"] == Oscillation.OSCILLATING).to_numpy()
-    report.headline["map_right"] = float((says == does).mean())
+    """Add the map, if there is one; returns at how many points the law of all is right."""
     parameters, table = list(found.records[0].parameters), pd.DataFrame([p.row for p in found.map])
     report.section("Where the model oscillates")
     report.samples("map", table)
@@ -314,9 +348,15 @@ def _add_map(
         report.figure("map", draw, CAPTIONS["map"])
     elif found.map:
         report.add("Nowhere on the map does the law's model oscillate.")
-    text = f"Oscillating or not, the law is right at {(says == does).sum()} of {len(does)} points"
-    quiet = f"; at {(~says & ~does).sum()} of the {(~does).sum()} that do not oscillate"
-    return f"{text}{quiet if not does.all() else ''}."
+    quiet = points["status"].isin(QUIET)
+    n_right = sum(run.holds for run in found.fitted)
+    n_rests = int((points["law"][quiet] == ALONE[Status.DECAYS]).sum())
+    report.headline |= {"n_fitted_sustained": n_right, "n_rests": n_rests}
+    text = f"The law of all points sustains {n_right} of the {len(found.fitted)} it was fitted to"
+    if quiet.any():
+        text += f", and rests at {n_rests} of {quiet.sum()} whose record is steady or decays"
+    rest = points["status"][~quiet & (points["branch"] != found.cycle)]
+    return f"{text}; not counted: {', '.join(rest)}." if len(rest) else f"{text}."
 
 
 def _metrics(found: FoundLaw) -> list[Metric[LawTrial]]:

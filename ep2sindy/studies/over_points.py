@@ -10,6 +10,7 @@ import pandas as pd
 
 from ep2sindy.figures.sustained import sustained_figure
 from ep2sindy.forecasting.evaluation import Evaluation
+from ep2sindy.model.comparison import Status
 from ep2sindy.report.document import Result, Text
 from ep2sindy.report.models import equations
 from ep2sindy.report.report import Report
@@ -130,10 +131,15 @@ def add_points(
     )
 
 
+def verdict(run: Evaluation) -> str:
+    """The status; one word for a run that follows the samples or sustains their oscillation."""
+    return str(Status.SUSTAINED if run.holds else run.status)
+
+
 def _rows(found: Mapping[str, Mapping[str, Fitted]]) -> pd.DataFrame:
     """One row per structure, way and point: what the figure draws."""
     rows = [
-        (fit.name, fit.way.name, point, str(fit.from_sample.status),
+        (fit.name, fit.way.name, point, verdict(fit.from_sample),
          abs(worst_amplitude(fit.from_sample) - 1.0))
         for point, fits in found.items()
         for fit in fits.values()

@@ -20,6 +20,7 @@ from ep2sindy.studies.study import Check, Deferred
 
 WITHOUT_BREATHING = (  # attributes of a simulation
     Oscillation.STEADY, Oscillation.DECAYING, Oscillation.TRANSIT, Oscillation.DIVERGED,
+    Oscillation.OUT,
 )  # fmt: skip
 
 Points = Annotated[

@@ -232,8 +232,9 @@ class Study:
         points = points_table(results, records)
         if law is not None:
             if law.at_points:
-                points["law"] = [str(point.status) for point in law.at_points]
-            of_law = add_law(report, law, points, self.labels)
+                points["law"] = law.outcomes
+            others = "other models or models=null" if self.models else "another ++degree=..."
+            of_law = add_law(report, law, points, self.labels, others)
             found = replace(found, blocks=[*found.blocks, Text(law.text)]) if found else of_law
         assert found is not None
         report.found(found)
@@ -403,7 +404,6 @@ def points_table(results: Sequence[PointResult], records: Records) -> pd.DataFra
             "f_kHz": 1e-3 * (record.cycle.frequency_Hz if record else result.f_Hz),
             "n_samples": result.n_samples,
             "dt_s": result.dt_s,
-            **{f"spread_{state}": value for state, value in result.spread.items()},
         }
         rows.append(row | {"relative_amplitude": record.relative_amplitude if record else np.nan})
     return pd.DataFrame(rows)

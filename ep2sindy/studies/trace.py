@@ -35,7 +35,6 @@ from ep2sindy.forecasting.baselines import AUTOREGRESSION
 from ep2sindy.forecasting.evaluation import Evaluation
 from ep2sindy.forecasting.skill import MODEL, ForecastSkill
 from ep2sindy.library.library import polynomial
-from ep2sindy.model.comparison import Status
 from ep2sindy.report.document import Text
 from ep2sindy.report.report import Report
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View, percent
@@ -151,7 +150,7 @@ class Study:
         seen = len(best.states.signal.t) == len(signal.t)
         where = "all of it, too short to hold out" if seen else "its end, which was not fitted"
         data_warnings = []
-        is_sustained = free.status is Status.SUSTAINED and not question
+        is_sustained = free.holds and not question
         if is_sustained and (data_warning := report_unknown_drive(signal)):
             data_warnings.append(Text(data_warning))
         report.found(
@@ -257,7 +256,7 @@ def _add_model(report: Report, signal: Signal, best: Attempt, free: Evaluation, 
     rows = ResultTable({NAME: free}, [*EVALUATION, *CYCLE])
     report.table("evaluations", rows, by_state=True, title=title, note=EVALUATED)
     if free.cycle_text:
-        report.add(Text(free.cycle_text, warning=free.status is not Status.SUSTAINED))
+        report.add(Text(free.cycle_text, warning=not free.holds))
     elif signal.cycle is not None:
         report.add(Text("the model has no cycle near its run", warning=True))
     add_cycle(report, NAME, free)
