@@ -27,6 +27,7 @@ from ep2sindy.app.arguments import mend
 from ep2sindy.app.runner import study_class
 from ep2sindy.app.schema import study_of
 from ep2sindy.data.open import write_field
+from ep2sindy.studies.benchmark import published_cells
 from tests.pages import (
     FENCE,
     PAGES,
@@ -254,6 +255,28 @@ def lost_names(text: str) -> Iterator[str]:
     ):
         if not (ROOT / name.strip("`")).is_file() and not re.search("NAME|my_", name):
             yield name
+
+
+@pytest.mark.parametrize(
+    ("title", "merit", "rounding"),
+    [
+        ("On the front", "on_front", 0.0),
+        ("Selected", "selected", 0.51),
+        ("Right terms", "mean_correct_terms", 0.0),
+    ],
+)
+def test_the_thesiss_benchmark_stands_beside_ours(title: str, merit: str, rounding: float) -> None:
+    """A dash stands where the thesis has no value."""
+    page = (ROOT / "docs" / "benchmark.md").read_text("utf-8")
+    section = page.partition(f"\n## {title}")[2].partition("\n## ")[0]
+    rows = re.findall(r"^\| (\w+) \|.*\n\| \*thesis\* \|(.*)\|$", section, re.M)
+    published = published_cells()
+    assert [name for name, _ in rows] == [*published["variant"].unique()]
+    for name, row in rows:
+        shown = re.findall(r"[\d.]+|-", row)
+        known = published.loc[published["variant"] == name, merit]  # by system and noise
+        printed = [np.nan if each == "-" else float(each) for each in shown]
+        np.testing.assert_allclose(printed, known, atol=rounding, err_msg=name)
 
 
 def test_what_a_page_links_to_is_there() -> None:
