@@ -21,6 +21,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig
 
 import ep2sindy as ep
+from benchmarks import thesis
 from benchmarks.regions import three_regions
 from ep2sindy._stubs import dotted_names
 from ep2sindy.app.arguments import mend
@@ -277,6 +278,20 @@ def test_the_thesiss_benchmark_stands_beside_ours(title: str, merit: str, roundi
         known = published.loc[published["variant"] == name, merit]  # by system and noise
         printed = [np.nan if each == "-" else float(each) for each in shown]
         np.testing.assert_allclose(printed, known, atol=rounding, err_msg=name)
+
+
+@pytest.mark.slow
+def test_the_thesiss_equations_are_judged_as_their_page_says(
+    capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those of Tables I to III, at one point and at six."""
+    monkeypatch.setattr(sys, "argv", ["thesis"])
+    thesis.main()
+    printed = capsys.readouterr().out.splitlines()
+    rows = [line for line in printed if line.startswith("| I")]
+    assert len(rows) == 13 + 6
+    page = (ROOT / "docs" / "thesis.md").read_text("utf-8")
+    assert [line for line in page.splitlines() if re.match(r"\| I+ \|", line)] == rows
 
 
 def test_what_a_page_links_to_is_there() -> None:
