@@ -8,7 +8,7 @@ TYPED := $(patsubst %,tests/test_%.py,types files numbers fields inspection kalm
 	propellants axial plane thruster model simulation forecast datasets weak constraints search systems given \
 	control_law refine operating_plots map_plots plots sklearn report compare experiment_benchmark)
 
-.PHONY: breathing test test-fast test-slow test-lowest test-docs lint types docs docs-numbers benchmark clean
+.PHONY: breathing thesis test test-fast test-slow test-lowest test-docs lint types docs docs-numbers benchmark clean
 
 # The stamp is written last: an interrupted installation is taken up again.
 .venv/installed: pyproject.toml constraints.txt
@@ -20,6 +20,17 @@ TYPED := $(patsubst %,tests/test_%.py,types files numbers fields inspection kalm
 
 breathing: .venv/installed
 	$(BIN)/python -m experiments.run +exp=breathing
+
+# The thesis's experiments, on a folder of its data: docs/thesis.md. make thesis FOLDER=runs DATA=mine
+FOLDER ?= runs
+DATA ?= hyphen
+SPT100 = data=$(DATA) trajectory.zone.z=downstream 'trajectory.zone.r=[0.035,0.05]' \
+	'prepare=[{_target_:ep2sindy.thruster.ionization_rate}]' $(MORE)
+thesis: .venv/installed
+	$(BIN)/python -m experiments.run -m +exp=breathing,weak,ils,constrained,pointwise \
+		data.path='$(FOLDER)/V300_m5.*' $(SPT100)
+	$(BIN)/python -m experiments.run +exp=parametric \
+		points.files='$(FOLDER)/V{V_D_V}_m{mdot_mg_s}.*' $(SPT100)
 
 lint: .venv/installed
 	$(BIN)/ruff check .

@@ -109,7 +109,7 @@ def test_a_study_is_built_from_its_signature() -> None:
             r"rows\[0\], Inner: got an unexpected .* 'hight'",
         ),
         ("rows=[{width: wide}]", r"rows\[0\].width must be a number: got 'wide'"),
-        ("search.max_terms=???", r"^search.max_terms must be set: it is still '\?\?\?'"),
+        ("search.max_terms=???", r"^search.max_terms must be set, got '\?\?\?'"),
         ("many.one=null", r"many.one must have \['width', 'label'\]: got None"),
         ("selection._target_=ep2sindy.BestSubset", "selection must name a _target_ that is a Sele"),
     ],
@@ -231,7 +231,7 @@ def test_a_launcher_that_fails_and_jobs_that_fail_elsewhere_are_said(
     ("overrides", "message"),
     [
         ([], "error: choose an experiment with +exp=NAME: benchmark, breathing"),
-        (["+exp=discover", "data=file", "data.path=x"], "trajectory.states must be set: it is"),
+        (["+exp=discover", "data=file", "data.path=x"], "trajectory.states must be set, got"),
         (["+exp=breathing", "output=/proc/none"], "choose another with output=PATH"),
     ],
 )

@@ -21,12 +21,14 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig
 
 import ep2sindy as ep
+from benchmarks import thesis
 from benchmarks.regions import three_regions
 from ep2sindy._stubs import dotted_names
 from ep2sindy.app.arguments import mend
 from ep2sindy.app.runner import study_class
 from ep2sindy.app.schema import study_of
 from ep2sindy.data.open import write_field
+from ep2sindy.studies.benchmark import published_cells
 from tests.pages import (
     FENCE,
     PAGES,
@@ -254,6 +256,42 @@ def lost_names(text: str) -> Iterator[str]:
     ):
         if not (ROOT / name.strip("`")).is_file() and not re.search("NAME|my_", name):
             yield name
+
+
+@pytest.mark.parametrize(
+    ("title", "merit", "rounding"),
+    [
+        ("On the front", "on_front", 0.0),
+        ("Selected", "selected", 0.51),
+        ("Right terms", "mean_correct_terms", 0.0),
+    ],
+)
+def test_the_thesiss_benchmark_stands_beside_ours(title: str, merit: str, rounding: float) -> None:
+    """A dash stands where the thesis has no value."""
+    page = (ROOT / "docs" / "benchmark.md").read_text("utf-8")
+    section = page.partition(f"\n## {title}")[2].partition("\n## ")[0]
+    rows = re.findall(r"^\| (\w+) \|.*\n\| \*thesis\* \|(.*)\|$", section, re.M)
+    published = published_cells()
+    assert [name for name, _ in rows] == [*published["variant"].unique()]
+    for name, row in rows:
+        shown = re.findall(r"[\d.]+|-", row)
+        known = published.loc[published["variant"] == name, merit]  # by system and noise
+        printed = [np.nan if each == "-" else float(each) for each in shown]
+        np.testing.assert_allclose(printed, known, atol=rounding, err_msg=name)
+
+
+@pytest.mark.slow
+def test_the_thesiss_equations_are_judged_as_their_page_says(
+    capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those of Tables I to III, at one point and at six."""
+    monkeypatch.setattr(sys, "argv", ["thesis"])
+    thesis.main()
+    printed = capsys.readouterr().out.splitlines()
+    rows = [line for line in printed if line.startswith("| I")]
+    assert len(rows) == 13 + 6
+    page = (ROOT / "docs" / "thesis.md").read_text("utf-8")
+    assert [line for line in page.splitlines() if re.match(r"\| I+ \|", line)] == rows
 
 
 def test_what_a_page_links_to_is_there() -> None:

@@ -1,6 +1,8 @@
 """A file of one's own on the command line: looked into, written down, run, and reported."""
 
 import json
+import shlex
+import subprocess
 import warnings
 from pathlib import Path
 
@@ -8,12 +10,17 @@ import numpy as np
 import pytest
 import xarray as xr
 import yaml
+from scipy.integrate import solve_ivp
+from scipy.io import savemat
 
 import ep2sindy as ep
 from ep2sindy.app.inspection import NEEDS
+from ep2sindy.app.runner import study_class
+from ep2sindy.app.schema import study_of
 from ep2sindy.data.quantities import DoubtfulUnit
 from ep2sindy.library.units import SECONDS
-from tests.programs import EXPERIMENTS, composed, computed, ended
+from ep2sindy.thruster import ionization_rate
+from tests.programs import EXPERIMENTS, ROOT, composed, computed, ended
 
 
 def lorenz_csv(path: Path, *, seed: int = 0, lost: int = 0) -> None:
@@ -165,3 +172,82 @@ def test_every_experiment_on_files_is_known_to_an_inspection() -> None:
     for name in ("breathing", "parametric", "pointwise"):
         text = str(composed(f"+exp={name}"))
         assert all(variable in text for variable in NEEDS[name])
+
+
+# Point by file: L (m), g_inj (m^-3 s^-1) and eps of the thesis's Eq. 25, from its Table V.
+EQ_25 = {
+    "V200_m5": (0.016, 2.72e23, 1.01), "V300_m2": (0.021, 7.31e22, 0.91),
+    "V300_m4": (0.024, 1.53e23, 0.81), "V300_m5": (0.025, 1.85e23, 0.78),
+    "V300_m6": (0.027, 2.17e23, 0.75), "V400_m5": (0.028, 1.57e23, 0.76),
+}  # fmt: skip
+NAMES = [
+    *(f"data.variables.{ours}.name=data.{ours[:3]}" for ours in ("n_i", "n_n", "T_e_eV")),
+    "data.variables.u_iz.name=data.uz", "data.variables.u_ir.name=data.ur",
+    'data.z.name="data.zs[:, 0]"', 'data.r.name="data.rs[0, :]"',
+]  # fmt: skip
+
+
+def write_uniform(path: Path, length: float, inflow: float, eps: float) -> None:
+    """A solution of Eq. 25 on a grid of 6 x 5 points: R_ion of T_e and u_iz oscillate at 10 kHz."""
+    fine = np.linspace(0.0, 1.2e-3, 8001)
+    warm = 20.0 + 2.0 * np.sin(2e4 * np.pi * fine)
+    rate = ionization_rate(xr.Dataset({"T_e_eV": ("time", warm)}))["R_ion"].values
+    speed = 9e3 + 5e2 * np.cos(2e4 * np.pi * fine)
+
+    def slope(t: float, n: np.ndarray) -> list[float]:
+        born = eps * n[0] * n[1] * np.interp(t, fine, rate)
+        return [born - n[0] * np.interp(t, fine, speed) / length, inflow - born]
+
+    rest = np.array([inflow * length / 9e3, 9e3 / (length * eps * rate.mean())])
+    times = fine[::10]
+    ions, neutrals = solve_ivp(slope, (0.0, times[-1]), rest, t_eval=times, rtol=1e-6).y
+    zs, rs = np.meshgrid(np.linspace(0.001, 0.024, 6), np.linspace(0.036, 0.049, 5), indexing="ij")
+    columns = {"n_i": ions, "n_n": neutrals, "T_e": warm[::10], "uz": speed[::10]}
+    data = {name: values[:, None, None] + 0 * zs for name, values in columns.items()}
+    savemat(path, {"data": data | {"ur": 0 * data["uz"], "zs": zs, "rs": rs}})
+
+
+def rerun(folder: Path) -> dict[str, list[str]]:
+    """By experiment the settings that `make thesis` gives it."""
+    make = ["make", "-n", "-o", ".venv/installed", "thesis", f"FOLDER={folder}"]
+    printed = subprocess.run(make, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    found = {}
+    for line in printed.replace("\\\n", "").splitlines():
+        words = [word for word in shlex.split(line)[3:] if word != "-m"]
+        for name in words[0].removeprefix("+exp=").split(","):
+            found[name] = [f"+exp={name}", *words[1:], f"output={folder}"]
+    return found
+
+
+@pytest.mark.parametrize(
+    ("name", "toy"),
+    [
+        pytest.param("breathing", ["sustained=none", "forecasts=0"], marks=pytest.mark.slow),
+        pytest.param("weak", [], marks=pytest.mark.slow),
+        pytest.param("ils", ["n_draws=1", "windows=[12]"], marks=pytest.mark.slow),
+        ("constrained", []),
+        pytest.param("pointwise", ["parallel=serial", "keep=false"], marks=pytest.mark.slow),
+        ("parametric", ["parallel=serial", "keep=false", "windows.n_windows=20"]),
+    ],
+)
+def test_the_thesis_is_rerun_on_a_folder_of_its_files(
+    folder: Path, name: str, toy: list[str]
+) -> None:
+    for point in EQ_25 if name == "parametric" else ["V300_m5"]:
+        write_uniform(folder / f"{point}.mat", *EQ_25[point])
+    found = computed(composed(*rerun(folder)[name], *NAMES, *toy))
+    assert found.summary["experiment"] == name
+    if name == "parametric":
+        shown = [q for q in found.summary["quantities"] if q["fit"] == "constrained"]
+        assert len(shown) == 3 * len(EQ_25)
+        assert [q["value"] for q in shown] == pytest.approx([q["thesis"] for q in shown], rel=0.02)
+    elif name == "constrained":
+        terms = found.summary["models"]["velocity_constrained"]["equations"]["n_i"]
+        exact = {"n_i*u_iz": -1 / 0.025, "n_i*n_n*R_ion": 0.78}
+        assert terms == pytest.approx(exact, rel=0.02)
+
+
+def test_the_names_that_the_thesis_does_not_state_are_asked_for_at_once() -> None:
+    config = composed("+exp=constrained", "data=hyphen", "data.path=a.mat")
+    with pytest.raises(ValueError, match=r"s.n_i.name, .*z.name and data.r.name must be set, got"):
+        study_of(study_class(config.study), config)

@@ -21,7 +21,7 @@ from ep2sindy._stubs import place_of
 from ep2sindy.app.targets import target_of
 from ep2sindy.discovery.method import AnyMethod, method_of
 from ep2sindy.report.folder import FORMATS
-from ep2sindy.runtime.screen import near_words
+from ep2sindy.runtime.screen import joined, near_words
 from ep2sindy.studies.source import Source, Step
 from ep2sindy.studies.study import Check, Deferred, ZeroOrMore
 from ep2sindy.trust.user_code import nodes_of
@@ -79,9 +79,9 @@ def study_of(study: type, config: DictConfig) -> Any:
         raise ValueError(f"unknown keys {sorted(unknown)}{near}; keys are {sorted(known)}{hint}")
     if isinstance(config.get("points"), str) and OmegaConf.is_missing(config.data, "path"):
         config.data.path = None  # the points name the files
-    for place, value in nodes_of(OmegaConf.to_container(config)):
-        if value == "???" and re.split(r"\W", place)[0] in used:
-            raise ValueError(f"{place} must be set: it is still '???'")
+    nodes = nodes_of(OmegaConf.to_container(config))
+    if unset := [at for at, node in nodes if node == "???" and re.split(r"\W", at)[0] in used]:
+        raise ValueError(f"{joined(unset)} must be set, got '???'")
     settings = plain(config)
     for name in {*COMMON} & {*settings}:
         value_of(COMMON[name], settings[name], name)
