@@ -294,9 +294,7 @@ def line(name: str, cases: Sequence[Case]) -> str:
     )
     fractions = [c.fraction for c in sustained]
     cpu_s = np.median([c.cpu_s for c in cases])
-    lost = Counter(
-        each.run.text for each in cases if not each.run.holds
-    )
+    lost = Counter(each.run.text for each in cases if not each.run.holds)
     return (
         f"{name:24s} {len(sustained)} of {len(cases)} live ({wrong} refuted); f {f} %; amplitude "
         f"{amplitude} %; waveform {waveform}; free coefficients {n_free}; multiplier {multiplier}; "
