@@ -159,8 +159,8 @@ def report_data(report: Report, data: Trajectory, field: xr.Dataset, place: str)
     more = [units, f"dominant frequency {frequencies}"]
     _report_samples(report, field, place, data.t, data.clock, *more)
     if data.n_samples < field.sizes["time"]:
-        report.warn(describe_gaps(data.t, field.sizes["time"]))
-    elif text := describe_breaks(data.t):
+        report.warn(describe_gaps(data.t, field.sizes["time"], data.clock))
+    elif text := describe_breaks(data.t, data.clock):
         report.warn(text)
 
 
