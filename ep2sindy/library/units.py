@@ -151,9 +151,6 @@ SHORT_UNITS = {
     "y": "year",
 }  # fmt: skip
 
-# How names of numbers end in files, and how where times count samples.
-IN_STEPS = {"_kHz": "_per_step", "_Hz": "_per_step", "_per_s": "_per_step", "_s": "_steps"}
-
 # Units in which dates are counted.
 CALENDAR = ("day", "h", "min", "s")
 
@@ -220,10 +217,10 @@ class Clock:
 
         Only times that count samples change them.
         """
-        ending = next((end for end in IN_STEPS if name.endswith(end)), "")
-        if self.unit != "step" or not ending:
+        if self.unit != "step":
             return name, 1.0
-        return name.removesuffix(ending) + IN_STEPS[ending], 1e3 if ending == "_kHz" else 1.0
+        per_step = re.sub("_(k?Hz|per_s)$", "_per_step", name)
+        return re.sub("_s$", "_steps", per_step), 1e3 if name.endswith("_kHz") else 1.0
 
     @staticmethod
     def of(unit: str) -> Clock:

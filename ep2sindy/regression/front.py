@@ -25,7 +25,8 @@ class Residual:
 
     chi_squared: per row, 1 if the residuals are nothing but noise. autocorrelation: of the
     residuals of neighbouring rows, then 0. leaves_noise: True if chi_squared is consistent with
-    noise alone. unexplained: root mean square of the residuals over that of the rates of change.
+    noise alone, or nearly nothing is left. unexplained: root mean square of the residuals over that
+    of the rates of change.
     """
 
     chi_squared: float

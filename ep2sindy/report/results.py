@@ -101,11 +101,9 @@ class Metric(Generic[Record]):
         """The same metric by the name, and in the unit, of the clock's values: see `Clock.key`."""
         key, factor = clock.key(self.key)
         made: Any = replace(self, key=key)
-        return (
-            replace(made, value=lambda record: factor * self.value(record))
-            if factor != 1.0
-            else made
-        )
+        if factor == 1.0:
+            return made
+        return replace(made, value=lambda record: factor * self.value(record))
 
     def of(
         self, part: Callable[[Outer], Record], key: str = "{}", view: View = View.ALL
