@@ -84,7 +84,7 @@ def test_a_phase_that_walks_is_not(seed: int) -> None:
 def test_a_record_in_which_nothing_moves_tells_neither() -> None:
     signal = prepare_signal(moved(van_der_pol, [2.0, 0.0], fraction=0.0, n_periods=40))
     assert ask_whether_driven(signal, {}) is None
-    assert report_unknown_drive(signal) is not None
+    assert "one cannot tell whether" in (report_unknown_drive(signal) or "")
 
 
 def test_what_falls_between_coarse_samples_is_no_push() -> None:

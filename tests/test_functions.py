@@ -130,7 +130,7 @@ def test_a_share_of_the_terms_keeps_only_the_functions_it_needs() -> None:
 
 def test_equations_are_written_in_every_language() -> None:
     terms = {"x": 1.0, "x*sin(2*v)/(0.5+n_i)^2": -2.0, "1/x": 3.0}
-    assert equation_text("x", terms) == "x' = 1 x - 2 x sin(2 v)/(0.5+n_i)^2 + 3/x"
+    assert equation_text("x", terms) == "x' = x - 2 x sin(2 v)/(0.5+n_i)^2 + 3/x"
     latex = r"\frac{x \, \sin(2 \, v)}{(0.5+n_{i})^{2}}"
     assert latex_term_name("x*sin(2*v)/(0.5+n_i)^2") == latex
     sympy = pytest.importorskip("sympy")

@@ -7,7 +7,7 @@ import pytest
 
 import ep2sindy as ep
 from benchmarks.known_systems import noisy
-from ep2sindy.data.gaps import between_gaps, mean_step
+from ep2sindy.data.gaps import between_gaps, describe_breaks, describe_gaps, mean_step
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.estimation.problem import scale_problem
 from ep2sindy.forecasting.baselines import spread_starts
@@ -158,3 +158,14 @@ def test_equations_are_found_next_to_gaps_as_without(name: str, kind: str) -> No
         system, run = noisy(name, 0.05, number, kind)
         found = ep.estimate(run, system.model.library)
         np.testing.assert_array_equal(found.model.coef != 0.0, system.model.coef != 0.0)
+
+
+@pytest.mark.parametrize(
+    ("unit", "gap"), [("day", "9 days"), ("step", "7.776e+05 steps"), ("s", "777.6 ks")]
+)
+def test_gaps_are_told_in_the_unit_of_the_times(unit: str, gap: str) -> None:
+    clock, t = ep.library.Clock.of(unit), 86400.0 * np.delete(np.arange(40.0), np.arange(20, 28))
+    assert f"the longest gap is {gap}, 9 times the usual step" in describe_gaps(t, 40, clock)
+    broken = np.append(t, t[-1] + 20.0 * 86400.0)
+    twenty = clock.duration_text(20.0 * 86400.0, digits=4)
+    assert f"the record has 1 gap: {twenty} pass after sample 32" in describe_breaks(broken, clock)

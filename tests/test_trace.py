@@ -14,8 +14,10 @@ from ep2sindy.discovery.one_signal import (
     try_in_turn,
 )
 from ep2sindy.signals.embedding import DROWNED, Embedding, embed_alike, unexplained
+from ep2sindy.signals.signal import prepare_signal
 from ep2sindy.signals.smoothers import ratio_bounds
 from ep2sindy.signals.spectrum import dominant_frequency, signal_memory_s
+from ep2sindy.studies.trace import lost_mean
 
 A, B = 2.0, 1.0  # of the Toda oscillator: g' = A - B x
 
@@ -345,3 +347,15 @@ def test_a_later_preparation_must_forecast_clearly_better() -> None:
     assert best.found.model.terms("v") == pytest.approx({"x": -(rate**2)}, rel=1e-2)
     assert free.forecast is None
     assert free.record.n_samples == len(signal.t)
+
+
+@pytest.mark.parametrize(
+    ("mean", "asked"), [(0.0, True), (0.02, True), (0.3, False), (-0.3, False)]
+)
+def test_a_lost_mean_is_asked_for_only_where_the_mean_is_zero(mean, asked):
+    """Mean in standard deviations, of pulses that cross zero over 20.5 periods."""
+    pulses = toda(20.5, start=(0.05, 0.0))
+    x = pulses.states[:, 0] - pulses.states[:, 0].mean()
+    question = lost_mean(prepare_signal(recorded(pulses.t, x + mean * x.std()), detrend=False))
+    assert (question is not None) == asked
+    assert not asked or "did x lose its mean" in question

@@ -249,7 +249,8 @@ def _coefficients(models: Mapping[str, SparseModel], clock: Clock) -> pd.DataFra
                 value, known = own[label].get(term), ends[label].get(term)
                 row[label] = "-" if value is None else f"{clock.seconds * value:.4g}"
                 if known is not None:
-                    row[label] += f" ±{0.5 * clock.seconds * (known[1] - known[0]):.2g}"
+                    reach = 0.5 * clock.seconds * (known[1] - known[0])
+                    row[label] += f" ±{reach:.2g}" if reach else " (known)"
             rows.append(row | {"intervals": _overlap([ends[n].get(term) for n in models])})
     return pd.DataFrame(rows)
 

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ep2sindy.library.units import Clock
+
 if TYPE_CHECKING:
     import xarray as xr
 
@@ -90,7 +92,7 @@ def mean_step(*times: Float[np.ndarray, " _"]) -> float:
     return float(duration / n_steps)
 
 
-def describe_gaps(t: Float[np.ndarray, " kept"], n_samples: int) -> str:
+def describe_gaps(t: Float[np.ndarray, " kept"], n_samples: int, clock: Clock) -> str:
     """Message with the number of missing samples and the longest gap.
 
     t: times of the samples that are left, in s. n_samples: number of samples before.
@@ -98,25 +100,31 @@ def describe_gaps(t: Float[np.ndarray, " kept"], n_samples: int) -> str:
     longest, usual = float(np.diff(t).max()), usual_step(t)
     return (
         f"{n_samples - len(t)} of {n_samples} samples are missing (NaN) and left out; the longest "
-        f"gap is {longest:.4g} s, {longest / usual:.0f} steps: crop the record if that is long "
-        "next to its period, or fill it with ep2sindy.data.interpolate"
+        f"gap is {clock.duration_text(longest, digits=4)}, {longest / usual:.0f} times the usual "
+        "step: crop the record if that is long next to its period, or fill it with "
+        "ep2sindy.data.interpolate"
     )
 
 
-def describe_breaks(t: Float[np.ndarray, " samples"]) -> str:
+def describe_breaks(t: Float[np.ndarray, " samples"], clock: Clock) -> str:
     """Message with the number of gaps in the times of a record, and the longest; "" for none."""
     n_gaps, steps = len(between_gaps(t)) - 1, np.diff(t)
     if not n_gaps:
         return ""
     k = int(steps.argmax())
+    longest, at, usual = (
+        clock.duration_text(time, digits=4) for time in (steps[k], t[k], usual_step(t))
+    )
     return (
-        f"the record has {n_gaps} gap{'s' * (n_gaps > 1)}: {steps[k]:.4g} s pass after sample "
-        f"{k + 1}, at {t[k]:.4g} s, where steps are {usual_step(t):.4g} s; nothing is filled in"
+        f"the record has {n_gaps} gap{'s' * (n_gaps > 1)}: {longest} pass after sample {k + 1}, at "
+        f"{at}, where steps are {usual}; nothing is filled in"
     )
 
 
 def describe_missing(
-    t: Float[np.ndarray, " samples"], absent: Mapping[str, Bool[np.ndarray, " samples"]]
+    t: Float[np.ndarray, " samples"],
+    absent: Mapping[str, Bool[np.ndarray, " samples"]],
+    clock: Clock,
 ) -> str:
     """Message with the number of missing samples of every column, and its longest gap.
 
@@ -126,7 +134,8 @@ def describe_missing(
     for name, lacks in absent.items():
         if lacks.any():
             longest = float(np.diff(t[~lacks]).max(initial=0.0))
-            parts.append(f"{name} {int(lacks.sum())}, its longest gap is {longest:.4g} s")
+            gap = clock.duration_text(longest, digits=4)
+            parts.append(f"{name} {int(lacks.sum())}, its longest gap is {gap}")
     return (
         f"of {len(t)} samples are missing (NaN): {'; '.join(parts)}. A search of trajectories does "
         "without them, others leave the samples out: fill them with ep2sindy.data.interpolate"

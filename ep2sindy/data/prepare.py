@@ -22,6 +22,7 @@ from ep2sindy.data.fields import (
     check_field,
     check_new,
     check_samples,
+    clock_of,
     grid_points,
     grid_values,
     mask_cells,
@@ -521,7 +522,7 @@ def derivative(field: xr.Dataset, *, variable: str, name: str | None = None) -> 
     Returns
     -------
     Dataset
-        The field with the rate, in the unit of the variable per second.
+        The field with the rate, in the unit of the variable per second, or per step.
     """
     array = _samples(field, variable)
     t = grid_points(field, "time")
@@ -530,7 +531,7 @@ def derivative(field: xr.Dataset, *, variable: str, name: str | None = None) -> 
     if len(t) < 3:
         raise ValueError(f"a derivative needs three samples or more, got {len(t)}")
     rate = np.gradient(array.values, t, axis=0, edge_order=2)
-    units = unit_product([(array.attrs["units"], 1), ("s", -1)])
+    units = unit_product([(array.attrs["units"], 1), (clock_of(field).of_values, -1)])
     return field.assign({name: array.copy(data=rate).assign_attrs(units=units)})
 
 

@@ -239,22 +239,24 @@ def _present(
     values: Float[np.ndarray, "samples states"],
     states: Sequence[str],
     partial: bool,
-    **kept_as_is: Any,
+    *,
+    clock: Clock,
+    units: Mapping[str, str],
 ) -> Trajectory:
     """The run without the samples that are NaN; partial: as in `trajectories_of`."""
     absent = np.isnan(values)
     if not absent.any():
-        return Trajectory(t, values, states, **kept_as_is)
+        return Trajectory(t, values, states, clock=clock, units=units)
     missing = None
     if partial and not absent.all(axis=0).any():
         kept = ~absent.all(axis=1)
         missing = absent[kept]
-        words = describe_missing(t, dict(zip(states, absent.T, strict=True)))
+        words = describe_missing(t, dict(zip(states, absent.T, strict=True)), clock)
     else:
         kept = present_rows(dict(zip(states, values.T, strict=True)))
-        words = describe_gaps(t[kept], len(t))
+        words = describe_gaps(t[kept], len(t), clock)
     warnings.warn(words, MissingSamples, stacklevel=5)
-    return Trajectory(t[kept], values[kept], states, missing=missing, **kept_as_is)
+    return Trajectory(t[kept], values[kept], states, missing=missing, clock=clock, units=units)
 
 
 def _elapsed(column: pd.Series) -> tuple[Float[np.ndarray, " rows"], Clock]:
@@ -277,4 +279,4 @@ def _from_arrays(t: object, x: object, partial: bool) -> Trajectory:
         )
     columns = real_numbers(states[:, None] if states.ndim == 1 else states, "states")
     names = ["x"] if states.ndim == 1 else [f"x{k}" for k in range(states.shape[1])]
-    return _present(seconds(times), columns, names, partial)
+    return _present(seconds(times), columns, names, partial, clock=SECONDS, units={})

@@ -16,7 +16,7 @@ import xarray as xr
 from jaxtyping import Bool, Float
 
 from ep2sindy.data.coerce import DiscoveryProblem
-from ep2sindy.data.fields import SPACE, check_field, grid_points, grid_values
+from ep2sindy.data.fields import SPACE, check_field, clock_of, grid_points, grid_values
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.method import Regression, SearchedEquation
@@ -213,9 +213,9 @@ def _empty(field: xr.Dataset, search: PointSearch) -> xr.Dataset:
     axes = [axis for axis in SPACE if axis in field.dims]
     shape = tuple(field.sizes[axis] for axis in axes)
     units = {name: str(field[name].attrs["units"]) for name in search.variables}
-    term_units = search.library.units(units)
+    term_units, time = search.library.units(units), clock_of(field).of_values
     coef_units = [
-        [unit_product([(units[state], 1), ("s", -1), (unit, -1)]) for unit in term_units]
+        [unit_product([(units[state], 1), (time, -1), (unit, -1)]) for unit in term_units]
         for state in search.states
     ]
     values = {

@@ -162,7 +162,8 @@ def with_guess(run: Trajectory, library: Library, ways: Sequence[Coupling]) -> T
     whole = run.state_names[0] if len(run.state_names) == 1 else ""
     units = dict(run.units)
     for way in ways:
-        rate, units = rates[way.state], units | {way.hidden: _unit(way, library, units)}
+        unit = _unit(way, library, units, run.clock.of_values)
+        rate, units = rates[way.state], units | {way.hidden: unit}
         if way.state != whole:
             terms = _evaluate(library, _linear_in(library, "", list(known)), known)
             rate = rate - terms @ least_squares(terms, rate)
@@ -284,7 +285,7 @@ def _fixed_by(
     return Coupling(hidden, state, term, relation.value / factor, given=True)
 
 
-def _unit(way: Coupling, library: Library, units: Mapping[str, str]) -> str:
-    """Unit of a hidden state whose term has a coefficient without unit."""
+def _unit(way: Coupling, library: Library, units: Mapping[str, str], time: str) -> str:
+    """Unit of a hidden state whose term has a coefficient without unit. time: that of time."""
     factor = library.terms[library.index(way.term)].unit({**units, way.hidden: "1"})
-    return unit_product([(units[way.state], 1), ("s", -1), (factor, -1)])
+    return unit_product([(units[way.state], 1), (time, -1), (factor, -1)])

@@ -26,7 +26,7 @@ from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.figures import style
 from ep2sindy.figures.style import COLOURS, DATA, GREY, MORE_COLOURS, TITLE, WIDTH
 from ep2sindy.library.equations import latex_derivative, latex_term_name
-from ep2sindy.library.units import unit_product, with_prefix
+from ep2sindy.library.units import SECONDS, unit_product
 from ep2sindy.operating.law import OperatingLaw
 from ep2sindy.operating.quantities import ControlLaw
 
@@ -132,12 +132,6 @@ def _focus(ax: Axes, values: np.ndarray) -> None:
     ax.set_ylim(0.5 * (low + high) - reach, 0.5 * (low + high) + reach)
 
 
-def frequency_scale(f_kHz: pd.Series) -> tuple[float, str]:
-    """Factor on kHz, and the unit, in which the typical frequency is near one."""
-    factor, prefix = with_prefix(1e3 * float(np.nanmedian(f_kHz)))
-    return 1e3 * factor, f"{prefix}Hz"
-
-
 def cycle_figure(
     rows: pd.DataFrame,
     points: pd.DataFrame,
@@ -154,8 +148,8 @@ def cycle_figure(
     left out if all are unknown, as of signals that swing around zero.
     """
     names, own = list(parameters), points["branch"] == branch
-    factor, unit = frequency_scale(points["f_kHz"][own])
-    rows, points = (table.assign(f_kHz=factor * table["f_kHz"]) for table in (rows, points))
+    factor, unit = SECONDS.frequency_scale(1e3 * float(np.nanmedian(points["f_kHz"][own])))
+    rows, points = (table.assign(f_kHz=1e3 * factor * table["f_kHz"]) for table in (rows, points))
     quantities = {"f_kHz": f"frequency ({unit})", "relative_amplitude": "relative amplitude"}
     if points["relative_amplitude"][own].isna().all():
         del quantities["relative_amplitude"]

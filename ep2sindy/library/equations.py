@@ -96,7 +96,8 @@ def equation_parts(
     """Terms of an equation as texts such as `+ 5.48e-14 n_i n_n`.
 
     terms: or groups of them, which become `+ n_i n_n (1.6e-32 n_i + 3.1e-33 n_n)`. reach:
-    half-width of the confidence interval by term name; adds it as `(±2e-16)`.
+    half-width of the confidence interval by term name; adds it as `(±2e-16)`, except for a known
+    coefficient, whose half-width is zero. A known factor of one is not written.
     """
     return _parts_in(TEXT, terms, digits, reach)
 
@@ -144,8 +145,11 @@ def _signed(body: str, value: float, first_gap: str, *, first: bool) -> str:
 
 
 def _text_term(name: str, size: float, half_width: float | None, digits: int) -> str:
-    error = "" if half_width is None else f" (±{half_width:.2g})"
-    factors = "" if name == "1" else " " + name.replace("*", " ")
+    factors = name.replace("*", " ")
+    if size == 1.0 and not half_width:
+        return factors
+    error = f" (±{half_width:.2g})" if half_width else ""
+    factors = "" if name == "1" else f" {factors}"
     factors = factors.replace(" 1/", "/", 1) if name.startswith(RECIPROCAL) else factors
     return f"{size:.{digits}g}{error}{factors}"
 
@@ -158,8 +162,11 @@ def _latex_term(name: str, size: float, half_width: float | None, digits: int) -
 
 
 def _html_term(name: str, size: float, half_width: float | None, digits: int) -> str:
-    error = "" if half_width is None else f" (&plusmn;{_number_html(half_width, 2)})"
-    return f"{_number_html(size, digits)}{error} {_term_html(name)}".strip()
+    error = f" (&plusmn;{_number_html(half_width, 2)})" if half_width else ""
+    term = _term_html(name)
+    if size == 1.0 and not error and term[:1] not in ("", "/"):
+        return term
+    return f"{_number_html(size, digits)}{error} {term}".strip()
 
 
 def sum_latex(terms: Sum, *, digits: int = 3) -> str:

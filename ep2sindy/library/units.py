@@ -15,7 +15,9 @@ if TYPE_CHECKING:
 
 
 # Symbols that pint keeps as they are, so that products of their powers need no registry.
-PLAIN = frozenset({"s", "m", "A", "V", "eV", "K", "T", "kg", "Hz", "W", "N", "J", "C", "Pa"})
+PLAIN = frozenset(
+    {"s", "step", "m", "A", "V", "eV", "K", "T", "kg", "Hz", "W", "N", "J", "C", "Pa"}
+)
 _PLAIN_FACTOR = re.compile(rf"({'|'.join(PLAIN)}|1)(?:\^(-?\d{{1,2}}))?")
 
 
@@ -191,7 +193,8 @@ def calendar_unit(step_s: float) -> str:
 class Clock:
     """Unit in which times are displayed, such as years; all values and files stay in seconds.
 
-    Seconds are displayed with SI prefixes, as 71 µs and 14.1 kHz.
+    Seconds are displayed with SI prefixes, as 71 µs and 14.1 kHz. Times that count samples are in
+    steps everywhere.
 
     Parameters
     ----------
@@ -203,6 +206,21 @@ class Clock:
 
     unit: str = "s"
     seconds: float = 1.0
+
+    @property
+    def of_values(self) -> str:
+        """Unit of time of all values: s, or step for times that count samples."""
+        return "step" if self.unit == "step" else "s"
+
+    def key(self, name: str) -> tuple[str, float]:
+        """Name in files of a number in seconds or Hz, and a factor: (`f_per_step`, 1e3) of `f_kHz`.
+
+        Only times that count samples change them.
+        """
+        if self.unit != "step":
+            return name, 1.0
+        per_step = re.sub("_(k?Hz|per_s)$", "_per_step", name)
+        return re.sub("_s$", "_steps", per_step), 1e3 if name.endswith("_kHz") else 1.0
 
     @staticmethod
     def of(unit: str) -> Clock:
@@ -246,8 +264,8 @@ class Clock:
 
     def rate_unit(self, unit: str) -> str:
         """Unit of a time derivative. unit: that of the variable."""
-        if self.unit == "s":
-            return unit_product([(unit, 1), ("s", -1)])
+        if self.unit == self.of_values:
+            return unit_product([(unit, 1), (self.unit, -1)])
         return f"{'' if unit == '1' else unit} {self.unit}^-1".strip()
 
 

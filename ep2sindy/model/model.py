@@ -81,7 +81,7 @@ class SparseModel:
     >>> library = ep.polynomial(["x", "v"], degree=1)
     >>> spring = ep.model.coef_matrix(library, [{"v": 1.0}, {"x": -4.0}])
     >>> print(ep.SparseModel(library, ["x", "v"], spring).text())
-    x' = 1 v
+    x' = v
     v' = -4 x
     """
 

@@ -98,7 +98,7 @@ def interval_table(
             numbers = [model.terms(state)[term], *ends]
             unit = unit_product([(model.units[state], 1), (units[term], -1)])
             shown = [f"{clock.seconds * number:.4g}" for number in numbers]
-            shown = shown if ends[0] < ends[1] else [shown[0], "exact", ""]  # or a relation
+            shown = shown if ends[0] < ends[1] else [shown[0], "known", ""]
             rows.append([f"{state}'", term.replace("*", " "), *shown, clock.rate_unit(unit)])
     columns = ["equation", "term", "coefficient", f"{words} from", "to", "unit"]
     table = pd.DataFrame(rows, columns=columns)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
 from ep2sindy.library.relations import Constraint
-from ep2sindy.library.units import Clock
+from ep2sindy.library.units import SECONDS, Clock
 from ep2sindy.model.model import SparseModel
 from ep2sindy.report.about import About, by_places, settings_used
 from ep2sindy.report.document import Block, Captioned, Picture, Result, Section, Table, Text
@@ -19,7 +19,7 @@ from ep2sindy.report.folder import RunFolder
 from ep2sindy.report.models import coefficients, model_blocks, model_facts
 from ep2sindy.report.page import page_html
 from ep2sindy.report.picture import Drawn, draw
-from ep2sindy.report.results import ResultTable, json_rows
+from ep2sindy.report.results import TIMES, ResultTable, json_rows, on_clock
 from ep2sindy.report.screen import PAGE, Screen, renderables
 from ep2sindy.report.tensorboard import Board
 from ep2sindy.runtime.files import replacing, write_json, write_text
@@ -41,7 +41,8 @@ class Report:
     and the command. watch: receives the progress. models, tables, figures: by the names of their
     files. sections: of the page. summary: entries of summary.json. headline: the few numbers by
     which runs are compared, whose names do not depend on the findings. result: what was found, the
-    beginning of the page and the end of the screen.
+    beginning of the page and the end of the screen. clock: of the record's times, by which numbers
+    are named in files.
     """
 
     title: str
@@ -59,6 +60,7 @@ class Report:
     summary: dict[str, Any] = field(default_factory=dict)
     headline: dict[str, float] = field(default_factory=dict)
     result: Result | None = None
+    clock: Clock = SECONDS
     messages: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     ends: list[Callable[[], None]] = field(default_factory=list)
@@ -119,6 +121,7 @@ class Report:
         """
         _once("table", name, [*self.tables, *self.summary])
         if isinstance(rows, ResultTable):
+            rows = replace(rows, metrics=[metric.on(self.clock) for metric in rows.metrics])
             frame, self.summary[name] = rows.csv(heading, by_state=by_state), rows.json()
             self.headline |= rows.headline()
         else:
@@ -136,6 +139,7 @@ class Report:
     def samples(self, name: str, frame: pd.DataFrame) -> None:
         """Add samples, such as those that a figure draws: tables/NAME.csv alone."""
         _once("table", name, self.tables)
+        frame = frame.rename(columns={time: self.clock.key(time)[0] for time in TIMES})
         write_text(self.folder.file(f"{name}.csv", "tables"), frame.to_csv(index=False))
         self.tables[name] = frame
 
@@ -204,7 +208,7 @@ class Report:
         write_text(self.folder.file(PAGE), page)
         named = {"experiment": self.title, "seed": self.seed}
         named |= {"warnings": self.warnings} if self.warnings else {}
-        found = named | self.summary | {"headline": self.headline}
+        found = named | on_clock(self.summary, self.clock) | {"headline": self.headline}
         write_json(self.folder.file("summary.json"), found)
         for end in self.ends:
             end()

@@ -20,6 +20,7 @@ from ep2sindy.report.document import cell_text
 
 LABELS = {
     "f_kHz": "frequency",
+    "f_per_step": "frequency",
     "f_error": "error of the frequency (relative)",
     "nrmse": "error of the trajectory (standard deviations)",
     "waveform_error": "error of the waveform (standard deviations)",
@@ -30,6 +31,10 @@ LABELS = {
     "identified_percent": "identified (%)",
     "d_pareto": "distance to the corner of the front",
 }
+
+
+# Names of times in files, other than those of metrics.
+TIMES = ("t_s", "dt_s", "period_s", "horizon_s", "unit_s")
 
 
 class View(Flag):
@@ -91,6 +96,14 @@ class Metric(Generic[Record]):
         if not isinstance(value, Mapping):
             return {heading.replace("{}", "").strip(): self.cell(value)}
         return {heading.format(part): self.cell(each) for part, each in value.items()}
+
+    def on(self, clock: Clock) -> Metric[Record]:
+        """The same metric by the name, and in the unit, of the clock's values: see `Clock.key`."""
+        key, factor = clock.key(self.key)
+        made: Any = replace(self, key=key)
+        if factor == 1.0:
+            return made
+        return replace(made, value=lambda record: factor * self.value(record))
 
     def of(
         self, part: Callable[[Outer], Record], key: str = "{}", view: View = View.ALL
@@ -177,6 +190,16 @@ class ResultTable(Generic[Record]):
         return [metric for metric in self.metrics if view in metric.view]
 
 
+def on_clock(entries: Any, clock: Clock) -> Any:
+    """Entries of a summary, with those of `TIMES` under the names of the clock's values."""
+    if not isinstance(entries, Mapping):
+        return entries
+    return {
+        clock.key(name)[0] if name in TIMES else name: on_clock(each, clock)
+        for name, each in entries.items()
+    }
+
+
 def json_rows(table: pd.DataFrame) -> list[dict[Any, Any]]:
     """Rows of a table for `summary.json`; a missing value becomes None."""
     return table.astype(object).where(table.notna(), None).to_dict("records")
@@ -203,8 +226,9 @@ def in_words(name: str) -> str:
 
 def value_text(name: str, value: float, clock: Clock = SECONDS) -> str:
     """A headline value as a cell; a frequency gets its unit, on the given clock."""
-    if name.split("/")[-1] == "f_kHz":
-        return clock.frequency_text(1e3 * value)
+    factor = {"f_kHz": 1e3, "f_per_step": 1.0}.get(name.split("/")[-1])
+    if factor is not None:
+        return clock.frequency_text(factor * value)
     return cell_text(value)
 
 

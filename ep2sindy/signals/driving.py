@@ -210,8 +210,8 @@ def report_unknown_drive(signal: Signal) -> str | None:
     if PhaseRecord.of(signal.t, signal.x, signal.cycle).has_moving_phase:
         return None
     return (
-        f"this record does not show whether {signal.name} sustains itself or is driven: its phase "
-        "moves between periods by no more than its noise, as in a clean cycle and in a clock"
+        f"from this record alone one cannot tell whether {signal.name} sustains its oscillation by "
+        "itself or is driven at this frequency, as by a clock"
     )
 
 

@@ -106,7 +106,8 @@ class Embedding:
         known = {}
         if self.how in ("rate", "derivative"):
             of_first = unit if self.how == "derivative" else "1"
-            units[1:] = [unit_product([(of_first, 1), ("s", -k)]) for k in range(1, self.n_states)]
+            time = signal.clock.of_values
+            units[1:] = [unit_product([(of_first, 1), (time, -k)]) for k in range(1, self.n_states)]
             known = dict(pairwise(names))
         if self.how == "rate":
             known[names[0]] = f"{names[0]}*{names[1]}"

@@ -11,7 +11,6 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
-from ep2sindy.discovery.choice import NoiseTest
 from ep2sindy.discovery.result import Discovery
 from ep2sindy.estimation.estimate import Estimate, Rival
 from ep2sindy.figures.fronts import front_figure
@@ -53,8 +52,6 @@ REPLACED = (
     "This section is about the likeliest model of the search. The rule chose another one, which "
     "was not tested against the noise."
 )
-# Nobody measured a simulation: what its samples show next to their smooth course is numerical.
-THE_NOISE = "the noise of the samples (of a simulation: its numerical noise)"
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,9 +135,10 @@ def add_candidates(
     for state in found.fronts:
         report.add(_front_table(found, state, (beside or {}).get(state, ())))
         if (left := found.noise_test.left.get(state)) is not None:
+            rate = f"{state}', the rate of change of {state}"
             report.add(
-                f"left over of {state}': {left.chi_squared:.3g} times {THE_NOISE}, autocorrelation "
-                f"{left.autocorrelation:.2f} (1 and 0 where noise alone is left)"
+                f"unexplained: {left.text(rate)}; correlation of what is left from one row to the "
+                f"next: {left.autocorrelation:.2f} (0 for noise)"
             )
     report.add(Text(column_note(label), page_only=True))
     caption = FRONT if any(front.has_errors for front in found.fronts.values()) else SCORED
@@ -173,20 +171,6 @@ def column_note(label: str) -> str:
     rule = RULES.get(label, f"{label}: the score of the selection, least selected")
     # Candidates scored by trajectories have neither rows nor bootstraps.
     return f"{rule}." if label == "deviance" else f"{rule}. {COLUMNS}"
-
-
-def left_over_of_all(tests: Sequence[NoiseTest]) -> list[Text]:
-    """What fits of derivatives leave beyond noise; nothing if they leave no more."""
-    if not any(test.lack_of_fit for test in tests):
-        return []
-    left = [each for test in tests for each in test.left.values() if not each.leaves_noise]
-    ratios = sorted(each.chi_squared for each in left)
-    size = f"{ratios[0]:.3g} to {ratios[-1]:.3g} times {THE_NOISE}" if left else "more than noise"
-    text = (
-        f"The equations fitted to derivatives leave {size}: a state or a term is missing there, so "
-        "they have no intervals; the free run above is the test."
-    )
-    return [Text(text)]
 
 
 RIVALS: Metrics[Rival] = [

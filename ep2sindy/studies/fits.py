@@ -87,6 +87,7 @@ CAPTION = (
     "start of its own; frequency error and nrmse of the run, from its first sample (full) "
     "and from a fitted start (dashed). The dotted line marks one period, the grey one 1 %."
 )
+BEST = "of {} fits, the one that runs best: by its status, and then by its distance to the data"
 FIGURES = ("trajectories", "phase")
 
 
@@ -280,7 +281,7 @@ class Study:
         report.found(
             found_model(
                 best, runs[best], file=best, picture="trajectories",
-                more=[Text(f"the best of {len(fits)} fits")], where=where, seen=not self.held_out,
+                more=[Text(BEST.format(len(fits)))], where=where, seen=not self.held_out,
                 held=fits[best].first.held_to,
             )
         )  # fmt: skip

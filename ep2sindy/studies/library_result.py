@@ -20,7 +20,7 @@ from ep2sindy.report.document import Result, Table, Text
 from ep2sindy.report.report import Report
 from ep2sindy.report.results import ResultTable
 from ep2sindy.studies.balance import ModelBalance
-from ep2sindy.studies.candidates import CandidateRow, left_over_of_all, selected_metrics
+from ep2sindy.studies.candidates import CandidateRow, selected_metrics
 from ep2sindy.studies.study import Coefficients
 from ep2sindy.studies.sustained import SUSTAINED_MODEL, SustainedModel
 from ep2sindy.studies.views import EVALUATED, EVALUATION, best_run, found_model, worst_run
@@ -128,7 +128,7 @@ def add_tables(report: Report, results: Mapping[str, LibraryResult]) -> None:
 
 
 def find_best(results: Mapping[str, LibraryResult], n_records: int) -> Result:
-    """The self-sustained model, or the best of those that were run; and what its rows leave over.
+    """The self-sustained model, or the best of those that were run.
 
     A self-sustained model was asked to sustain its oscillation, so its free run heads the result;
     any other model, its forecasts.
@@ -153,14 +153,13 @@ def find_best(results: Mapping[str, LibraryResult], n_records: int) -> Result:
         )
     best = best_run({name: each.run for name, each in sustained.items()})
     run = sustained[best].run
-    note = [Text(f"{sustained[best].discovery.note}.")]
-    tests = [result.discovery.noise_test for result in results.values()]
+    note = Text(f"{sustained[best].discovery.note}.")
     return found_model(
         best,
         run,
         file=f"{best}_sustained",
         picture="trajectories" if run.cycle is None else f"free_run_{best}",
-        more=[*note, *left_over_of_all(tests)],
+        more=[note],
         where="held-out time",
         held=sustained[best].discovery.constraint,
     )

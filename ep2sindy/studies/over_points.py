@@ -115,16 +115,16 @@ def add_points(
             report.model(f"{name}_{number}", fit.model, held=held_to, shown=False)
     counts = {name: n_sustained(each.runs) for name, each in over.items()}
     lines = [
-        Text(f"sustained at {n} of {len(found)}: {', '.join(names)}")
+        Text(f"fits that sustain it at {n} of {len(found)} points: {', '.join(names)}")
         for n in range(len(found), 0, -1)
         if (names := [name for name, count in counts.items() if count == n])
     ]
     structures = {over[name].fits[0].name for name, n in counts.items() if n == len(found)}
     report.found(
         Result(
-            f"{len(structures)} of {len(sources)} structures are sustained at all "
+            f"{len(structures)} of {len(sources)} structures sustain the oscillation at all "
             f"{len(found)} points",
-            lines or [Text("none is sustained at any point")],
+            lines or [Text("no fit sustains the oscillation at any point")],
             load='pandas.read_csv("{}/tables/over_points.csv")',
             picture="sustained",
         )

@@ -346,9 +346,9 @@ class Study:
         if known and "path" in self.source.data.settings:
             name, held = list(known.items())[-1]
             report.say(
-                f"data are files, and models hold known coefficients, models.{name}.known={held}, "
-                "which as shipped are those of the package's thruster; set them to those of yours "
-                f"for each of {list(known)}, or leave such models out: ~models.{name}"
+                f"models of these files hold coefficients for known, models.{name}.known={held}: "
+                "they must be those of your thruster (as shipped, the simulator's) in each of "
+                f"{list(known)}; or leave such models out: ~models.{name}"
             )
 
 

@@ -159,8 +159,8 @@ def report_data(report: Report, data: Trajectory, field: xr.Dataset, place: str)
     more = [units, f"dominant frequency {frequencies}"]
     _report_samples(report, field, place, data.t, data.clock, *more)
     if data.n_samples < field.sizes["time"]:
-        report.warn(describe_gaps(data.t, field.sizes["time"]))
-    elif text := describe_breaks(data.t):
+        report.warn(describe_gaps(data.t, field.sizes["time"], data.clock))
+    elif text := describe_breaks(data.t, data.clock):
         report.warn(text)
 
 
@@ -173,6 +173,7 @@ def _report_samples(
     *more: str,
 ) -> None:
     """Report file, place and samples; warn of a step that contradicts the file's own times."""
+    report.clock = clock
     step, start = (clock.duration_text(time, digits=4) for time in (usual_step(t), t[0]))
     samples = f"{len(t)} samples of {step} from {start}"
     words = [field.attrs.get("file", ""), place, samples, *more]
@@ -183,11 +184,12 @@ def _report_samples(
 
 def data_summary(data: Trajectory) -> dict[str, Any]:
     """The summary of a trajectory."""
+    key, factor = data.clock.key("f_kHz")
     return {
         "n_samples": data.n_samples,
         "dt_s": data.dt_s,
-        "time_unit": data.clock.unit,  # for display only; numbers are in seconds
-        "f_kHz": 1e-3 * dominant_frequency(data.t, data.states[:, 0]),
+        "time_unit": data.clock.unit,  # of the screen; numbers are in seconds, or in steps
+        key: factor * 1e-3 * dominant_frequency(data.t, data.states[:, 0]),
         "variables": list(data.names),
         "units": dict(data.units),
     }

@@ -232,15 +232,20 @@ def _equals_linear(skill: ForecastSkill) -> bool:
 
 
 def lost_mean(signal: Signal) -> str | None:
-    """A message if the signal is one-sided pulses about a mean of zero; otherwise None."""
+    """A question if the signal is one-sided pulses whose mean is zero; otherwise None.
+
+    A part of a period that is left over moves the mean by up to its part of the record.
+    """
     away = signal.x - np.median(signal.x)
     one_way = float(np.mean(away**3) / np.mean(away**2) ** 1.5)
-    if signal.is_positive or not one_way > PULSES:
+    error = signal.x.std() / signal.n_periods
+    if signal.is_positive or not one_way > PULSES or abs(signal.x.mean()) > error:
         return None
+    zero = f"{error:.2g} {signal.unit}".removesuffix(" 1")
     return (
-        f"{signal.name} is pulses that take either sign, as a positive signal does that lost its "
-        f"mean in a capacitor: offset=MEAN gives it back (over {-signal.x.min():.3g}; offset=fit "
-        "looks for it), and the growth rate with it, which is simpler"
+        f"did {signal.name} lose its mean, as behind a capacitor? It is pulses to one side whose "
+        f"mean is zero to within {zero}. If so, offset=MEAN gives it back (more than "
+        f"{-signal.x.min():.3g}; offset=fit looks for it), and simpler equations are tried"
     )
 
 

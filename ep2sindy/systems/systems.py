@@ -179,8 +179,8 @@ def lotka_volterra(*, a: float = 2 / 3, b: float = 1.0, c: float = 1.0, d: float
     Examples
     --------
     >>> print(ep.lotka_volterra(a=0.5).model.text())
-    x' = 0.5 x - 1 x y
-    y' = -0.333 y + 1 x y
+    x' = 0.5 x - x y
+    y' = -0.333 y + x y
     """
     equations = {"x": {"x": a, "x*y": -b}, "y": {"y": -d, "x*y": c}}
     return _system("Lotka-Volterra", equations, 2, [1.0, 0.5], 100.0, 10.0)
@@ -275,7 +275,7 @@ def pendulum(*, length: float = 1.0, gravity: float = 9.81) -> System:
     Examples
     --------
     >>> print(ep.pendulum().model.text())
-    theta' = 1 w
+    theta' = w
     w' = -9.81 sin(theta)
     """
     equations = {"theta": {"w": 1.0}, "w": {"sin(theta)": -gravity / length}}
