@@ -386,7 +386,8 @@ def test_a_pendulum_is_found_in_noise_and_runs_on_its_own(
     energy = 0.5 * speed * w**2 + restoring * np.cos(theta)
     assert np.ptp(energy) < 1e-4  # of some 4
     assessed = ep.evaluate(found.model, truth)
-    assert assessed.status in (ep.model.Status.FOLLOWS, ep.model.Status.WRONG_FREQUENCY)
+    status = ep.model.Status
+    assert assessed.status in (status.FOLLOWS, status.NEUTRAL, status.WRONG_FREQUENCY)
 
 
 @pytest.mark.slow
