@@ -83,6 +83,8 @@ def computed(config: DictConfig) -> Computed:
         kind = study_class(config.study)
         study_of(kind, config).run(report)
         report.finish(purpose=purpose_of(kind), keys=keys_of(kind), formats=())
+        assert report.result is not None
+        assert len(report.result.title.split()) <= 12, report.result.title  # the verdict alone
     log, page = ((report.folder.path / name).read_text() for name in ("run.log", "report.html"))
     return Computed(report, log, page)
 

@@ -159,7 +159,7 @@ def test_a_program_without_a_home_says_once_that_nothing_is_kept(tmp_path: Path)
     )
     command = ["-m", "ep2sindy.app.main", *study.split(), f"output={tmp_path}"]
     run = called(tmp_path, *command, env=homeless(tmp_path))
-    assert "Found: ours, selected exactly right" in run.stdout
+    assert "ours, selected exactly right" in run.stdout
     said = [line for line in run.stderr.splitlines() if line.startswith("ep2sindy: ")]
     assert said == [compilation.ANNOUNCEMENT, NO_HOME]
 

@@ -77,14 +77,15 @@ class Following:
         if not len(seen):
             return np.full((1, len(self.unit)), np.nan)
         begin = np.array([first + int(seen[0])])
-        n, start, whole = self._per_turn, None, last - 1 - int(begin[0])
+        whole = last - 1 - int(begin[0])
+        n = min(self._per_turn, whole)
+        start = along.fitted(begin, n)
         while True:
-            n = min(n, whole)
-            start = along.fitted(begin, n, start)
             squares = np.square(along.off(along.paths(start, begin, n), begin)[0] / self.unit)
             if n == whole or not np.nanmean(squares) <= FAR**2:
                 break
-            n *= 2
+            n = min(2 * n, whole)
+            start = along.nearer(begin, n, start)
         return squares if n == whole else np.full((1, len(self.unit)), np.inf)
 
     @property

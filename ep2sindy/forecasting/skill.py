@@ -48,6 +48,7 @@ from ep2sindy.signals.spectrum import is_uniform
 
 PERIODS_AHEAD = 4.0  # longest horizon
 NEARER = 0.9  # fraction of the model's error below which a baseline is clearly nearer
+FEWEST = 0.1  # fraction of the horizons from which a span that begins later counts: many are tried
 EARLY = 0.25  # periods, over which a forecast must not be worse than the last sample or the mean
 MODEL, MEAN = "model", "mean"
 WORDS = {
@@ -118,7 +119,8 @@ class ForecastSkill:
 
         At each of them the gain in mean square error, over the rival and over the mean of the
         samples, exceeds its standard error over the starts; averaged over all of them, the gain
-        over the rival is one that chance makes in a case of twenty. None if there is no such span.
+        over the rival is one that chance makes in a case of twenty. A span that does not begin at
+        the first horizon is at least a tenth of them. None if there is no such span.
         """
         own = self.squared[MODEL]
         gain = self.squared[self.rival] - own
@@ -127,7 +129,10 @@ class ForecastSkill:
             for n in range(own.shape[1])
         ]
         for first, last in _spans(exceeds):
-            if self._exceeds(gain[:, first : last + 1].mean(axis=1), last, SURE):
+            least = 1 if not first else FEWEST * len(exceeds)
+            if last - first + 1 >= least and self._exceeds(
+                gain[:, first : last + 1].mean(axis=1), last, SURE
+            ):
                 return first, last
         return None
 

@@ -371,4 +371,4 @@ def error_cells(outcomes: pd.DataFrame, forms: Ways) -> pd.DataFrame:
 
 def _found(report: Report, title: str, details: str, picture: str, table: str) -> None:
     load = f'pandas.read_csv("{{}}/tables/{table}.csv")'
-    report.found(Result(f"Found: {title}", [Text(details)], load=load, picture=picture))
+    report.found(Result(title, [Text(details)], load=load, picture=picture))

@@ -184,11 +184,15 @@ def found_regimes(regimes: Regimes, points: str) -> Result:
     lead = f"in the largest, {int((regimes.labels == 0).sum())} points"
     largest = [Equation(s, t, lead=lead, on_screen=True) for s, t in regimes.equations(0).items()]
     count = f"{regimes.n_regimes} regime{'s' if regimes.n_regimes > 1 else ''}"
-    limit = ", as many as max_regimes allows: the points may bear more" if regimes.at_limit else ""
+    limit = (
+        [Text("as many regimes as max_regimes allows: the points may bear more")]
+        if regimes.at_limit
+        else []
+    )
     unsure = float((regimes.confidence < UNSURE).sum() / regimes.confidence.count())
     return Result(
-        f"Found: {count}{limit}; confidence below {UNSURE:g} at {100.0 * unsure:.0f} % of points",
-        [*largest, Text(points)],
+        f"{count}; confidence below {UNSURE:g} at {100.0 * unsure:.0f} % of points",
+        [*largest, *limit, Text(points)],
         load='xarray.open_dataset("{}/pointwise.nc")',
         picture="regimes",
     )

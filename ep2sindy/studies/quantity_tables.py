@@ -101,8 +101,8 @@ def add_quantities(
     n_fitted = sum(bool(result.fits) for result in results)
     picture = f"trends_{best.removesuffix(REFINED)}"
     return Result(
-        f"Found: {len(shown) or 'no'} control laws over {n_fitted} operating points that "
-        f"oscillate{best and f', by the fit {best}'}",
+        f"{len(shown) or 'No'} control laws over {n_fitted} operating points"
+        f"{best and f', by {best}'}",
         shown[:MOST_LAWS],
         load='pandas.read_csv("{}/tables/control_laws.csv")',
         picture=picture if picture in report.figures else "",
