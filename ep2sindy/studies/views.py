@@ -209,10 +209,7 @@ EVALUATION: Metrics[Evaluation] = [
 CYCLE: Metrics[Evaluation] = [
     Metric("stability", lambda run: run.cycle and run.cycle.stability),
     Metric("multiplier", lambda run: run.multiplier, COMPARED),
-    Metric("basin_stability", lambda run: run.basin_stability, COMPARED),
     Metric("rest", lambda run: _rest(run)),
-    Metric("rest_growth_per_s", lambda run: run.rest and run.rest.growth_per_s),
-    Metric("rest_frequency_Hz", lambda run: run.rest and run.rest.frequency_Hz),
 ]
 EVALUATED = (
     "Amplitude: standard deviation over the data's. Waveform: RMS difference of one period, in "
