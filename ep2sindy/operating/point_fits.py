@@ -17,18 +17,12 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library, named_terms, polynomial
 from ep2sindy.library.relations import Constraint
 from ep2sindy.model.model import SparseModel
-from ep2sindy.operating.law import (
-    LawConstraint,
-    LawFunctions,
-    OperatingLaw,
-    make_basis,
-    read_coefficients,
-)
+from ep2sindy.operating.law import LawConstraint, LawFunctions, OperatingLaw, make_basis
 from ep2sindy.refinement.assess import RefinementStatus
 from ep2sindy.refinement.problem import RefinementSettings
 from ep2sindy.refinement.refine import Refinement, refine
-from ep2sindy.regression.constrained import solve_constrained
-from ep2sindy.regression.pooled import invert_covariance, pool_rows, root_of
+from ep2sindy.regression.constrained import read_coefficients, solve_constrained
+from ep2sindy.regression.pooled import invert_covariance, pool_rows, residuals_left_out, root_of
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.runtime.progress import SILENT, Progress
 
@@ -153,7 +147,7 @@ class PointFits:
         Raises ValueError if the points do not suffice for a law without each of them.
         """
         basis = make_basis(functions, self.columns(functions), n_spare=1)
-        missed = pool_rows(self._rows, basis, self._size).left_out(self._rows, basis)
+        missed = residuals_left_out(self._rows, basis, self._size)
         pairs = zip(missed, self._rows, strict=True)
         return np.array([norm(off) / norm(y) if y.any() else 1.0 for off, (_, y) in pairs])
 
@@ -167,7 +161,7 @@ class PointFits:
     ) -> Float[np.ndarray, "free functions"]:
         kept = [k for k in range(len(self.models)) if k != without]
         basis = make_basis(functions, self.columns(functions)[kept])
-        return pool_rows([self._rows[k] for k in kept], basis, self._size).law
+        return pool_rows([self._rows[k] for k in kept], basis, self._size)
 
     @cached_property
     def _size(self) -> Float[np.ndarray, " free"]:
