@@ -56,16 +56,21 @@ def search_conserving_systems(
     terms = [task.library.index(process.term) for process in processes]
     means = task.theta.mean(axis=0)[terms] if roles.forward else None
 
-    def build(support: Support) -> tuple[list[Process], np.ndarray, np.ndarray | None]:
+    def parts_of(support: Support) -> tuple[list[Process], np.ndarray, np.ndarray | None]:
         """Processes of a support, their coefficients, and the means of their terms."""
         chosen, values = support
         own_means = None if means is None else means[chosen]
         return [processes[k] for k in chosen], values / norms[chosen], own_means
 
-    admissible = [support for support in whole if not find_broken_demands(*build(support))]
+    admissible = [support for support in whole if not find_broken_demands(*parts_of(support))]
     kept = _keep_first(admissible or whole, depth)
-    systems = [_build_system(task, roles, *build(support)) for support in kept]
-    found = [system for system in systems if system is not None]
+    found = []
+    for chosen, values, own_means in map(parts_of, kept):
+        held = constraint_of(task.library, task.states, chosen, roles.known_processes)
+        if held is not None:  # its coefficients tell the processes apart
+            fixed = np.array([roles.known.get(held.coefficients[k], 0.0) for k in held.free])
+            free = process_matrix(held) @ values + fixed
+            found.append(TrialSystem.of(task, held, free, own_means))
     if not found:
         raise ValueError(
             f"no system of up to {masks.sum(axis=1).max(initial=0)} terms plays all of the roles "
@@ -131,22 +136,6 @@ def _rank_supports(
 def _keep_first(supports: Sequence[Support], depth: int) -> list[Support]:
     sizes = [len(chosen) for chosen, _ in supports]
     return [each for k, each in enumerate(supports) if k - sizes.index(sizes[k]) < depth]
-
-
-def _build_system(
-    task: DiscoveryProblem,
-    roles: Roles,
-    processes: Sequence[Process],
-    values: Float[np.ndarray, " processes"],
-    means: Float[np.ndarray, " processes"] | None,
-) -> TrialSystem | None:
-    """The system of these processes; None if its coefficients do not tell them apart."""
-    held = constraint_of(task.library, task.states, processes, roles.known_processes)
-    if held is None:
-        return None
-    known = roles.known
-    fixed = np.array([known.get(held.coefficients[k], 0.0) for k in held.free])
-    return TrialSystem.of(task, held, process_matrix(held) @ values + fixed, means)
 
 
 def _add_fronts(
