@@ -20,7 +20,6 @@ from ep2sindy.data.gaps import mean_step
 from ep2sindy.data.trajectory import Trajectory, spread_blocks
 from ep2sindy.discovery.result import Discovery, DiscoveryMethod, NoiseTest
 from ep2sindy.estimation.noise import are_white
-from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Constraint, Relation, binding, constraint
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.regression.constrained import constrained_fit
@@ -93,7 +92,12 @@ def choose(
         return replace(join_choice(won, best, model, method), noise_test=test, constraint=held)
     best = [front.best for front in scored]
     fits = [fit_last(*pair) for pair in zip(scored, best, strict=True)]
-    model = assemble_model(library, fits, units=units, provenance=provenance)
+    blocks = [fit.covariance for fit in fits if fit.covariance is not None]
+    # Errors of different equations are independent.
+    covariance = block_diag(*blocks) if len(blocks) == len(fits) else None
+    coef = coef_matrix(library, [fit.coef_by_term for fit in fits])
+    states = [fit.equation for fit in fits]
+    model = SparseModel(library, states, coef, units, provenance, covariance)
     test = NoiseTest({fit.equation: fit.left for fit in fits if fit.left is not None})
     return replace(join_choice(scored, best, model, method), noise_test=test)
 
@@ -256,25 +260,6 @@ def _describe_lack_of_fit(left: Mapping[str, Residual], related: Collection[str]
 def fit_last(front: ParetoFront, candidate: Candidate) -> Candidate:
     """Final fit of a selected candidate, weighted if the noise of its rows is known."""
     return candidate if front.rows.noisy is None else reweight(front.rows, candidate)
-
-
-def assemble_model(
-    library: Library,
-    fits: Sequence[Candidate],
-    *,
-    units: Mapping[str, str],
-    provenance: Mapping[str, str],
-) -> SparseModel:
-    """Join one fit per equation into a model, with errors independent between equations."""
-    blocks = [fit.covariance for fit in fits if fit.covariance is not None]
-    return SparseModel(
-        library=library,
-        states=[fit.equation for fit in fits],
-        coef=coef_matrix(library, [fit.coef_by_term for fit in fits]),
-        units=units,
-        provenance=provenance,
-        covariance=block_diag(*blocks) if len(blocks) == len(fits) else None,
-    )
 
 
 def reweight(

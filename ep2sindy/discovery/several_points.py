@@ -145,14 +145,8 @@ def choose_law(fits: PointFits, law: LawFunctions | Sequence[LawFunctions]) -> O
     """
     if isinstance(law, int | str | Library):
         return fits.law(fits.functions(law))
-    laws, reasons = [], ["law=[...] must name degrees or functions"]
-    for each in law:
-        try:
-            functions = fits.functions(each)
-            laws.append((functions, fits.rate_errors(functions)))
-        except ValueError as error:
-            reasons.append(str(error))
-    if not laws:
-        raise ValueError(reasons[-1])
-    best = fewest_of_least([(errors, len(functions)) for functions, errors in laws])
-    return fits.law(laws[best][0])
+    tested, reasons = fits.test_laws(law)
+    if not tested:
+        raise ValueError(["law=[...] must name degrees or functions", *reasons][-1])
+    best = fewest_of_least([(errors, len(functions)) for functions, errors in tested])
+    return fits.law(tested[best][0])

@@ -84,7 +84,12 @@ def cut_windows(
     """
     rng = np.random.default_rng(rng)
     check_windows(n_windows, window)
-    _check_room(trajectories, window)
+    longest = _longest(trajectories)
+    if window > longest:
+        raise ValueError(
+            f"a window must fit into a trajectory, between its gaps: {window} samples were asked "
+            f"of at most {longest}; shorten it, or leave it out to have it chosen"
+        )
     values = [trajectory.columns([*states, *inputs]) for trajectory in trajectories]
     joined = np.concatenate(values)
     n = len(states)
@@ -156,15 +161,6 @@ def _longest(trajectories: Sequence[Trajectory]) -> int:
     if not trajectories:
         raise ValueError("refinement needs at least one trajectory, got none")
     return max(stop - start for run in trajectories for start, stop in between_gaps(run.t))
-
-
-def _check_room(trajectories: Sequence[Trajectory], window: int) -> None:
-    longest = _longest(trajectories)
-    if window > longest:
-        raise ValueError(
-            f"a window must fit into a trajectory, between its gaps: {window} samples were asked "
-            f"of at most {longest}; shorten it, or leave it out to have it chosen"
-        )
 
 
 def _places(

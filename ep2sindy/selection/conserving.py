@@ -51,8 +51,14 @@ def search_conserving_systems(
     columns, target = _join_rows(problems, task, processes, roles.known)
     norms = column_norms(columns)
     unit = columns / norms
-    masks = search.supports(unit.T @ unit, unit.T @ target, float(target @ target))
-    whole = _rank_supports(_keep_complete(masks, processes, roles.names), unit, target)
+    xx, xy = unit.T @ unit, unit.T @ target
+    masks = search.supports(xx, xy, float(target @ target))
+    complete = _keep_complete(masks, processes, roles.names)
+    coef = fit_masks(xx, xy, complete)
+    # The smallest come first, of a size by their residual.
+    order = np.lexsort([*~complete.T[::-1], -coef @ xy, complete.sum(axis=1)])
+    independent = order[np.isfinite(coef[order]).all(axis=1)]
+    whole = [(np.flatnonzero(complete[k]), coef[k, complete[k]]) for k in independent]
     terms = [task.library.index(process.term) for process in processes]
     means = task.theta.mean(axis=0)[terms] if roles.forward else None
 
@@ -118,19 +124,6 @@ def _keep_complete(
     roles = [role for role in named if role in given or role.endswith(" free")]
     played = [np.any(masks[:, [p.role == role for p in processes]], axis=1) for role in roles]
     return masks[np.all(played, axis=0)]
-
-
-def _rank_supports(
-    masks: Bool[np.ndarray, "supports processes"],
-    columns: Float[np.ndarray, "rows processes"],
-    target: Float[np.ndarray, " rows"],
-) -> list[Support]:
-    """The supports with their coefficients, smallest sizes first, of a size by their residual."""
-    xy = columns.T @ target
-    coef = fit_masks(columns.T @ columns, xy, masks)
-    order = np.lexsort([*~masks.T[::-1], -coef @ xy, masks.sum(axis=1)])
-    independent = order[np.isfinite(coef[order]).all(axis=1)]
-    return [(np.flatnonzero(masks[k]), coef[k, masks[k]]) for k in independent]
 
 
 def _keep_first(supports: Sequence[Support], depth: int) -> list[Support]:
