@@ -130,16 +130,8 @@ def births(n, g, nn, state, model, w):
         if below < 0:
             birth(rates[t + 1], n_e, nn, speed, w.consumed, gain, momentum_gain, False)
         else:
-            further_birth(
-                rates[t + 1],
-                n_e,
-                n[below],
-                g[below],
-                w.gain[below],
-                w.momentum_gain[below],
-                gain,
-                momentum_gain,
-            )
+            loss, drag = w.gain[below], w.momentum_gain[below]
+            further_birth(rates[t + 1], n_e, n[below], g[below], loss, drag, gain, momentum_gain)
 
 
 @compiled(**FAST)
