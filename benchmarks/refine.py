@@ -114,14 +114,7 @@ def forced(rng: np.random.Generator) -> Case:
 
 
 def problem(case: Case) -> RefinementProblem:
-    batch = cut_windows(
-        [case.data],
-        states=STATES,
-        inputs=case.start.inputs,
-        n_windows=N_WINDOWS,
-        window=WINDOW,
-        rng=np.random.default_rng(0),
-    )
+    batch = cut_windows([case.data], case.start, n_windows=N_WINDOWS, window=WINDOW, rng=0)
     return RefinementProblem.of([case.start], [batch], [None], free_start=False)
 
 

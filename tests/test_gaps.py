@@ -144,10 +144,7 @@ def test_means_of_samples_do_not_reach_across_a_gap() -> None:
 def test_refinement_takes_windows_between_gaps_alone() -> None:
     assert dominant_window([GAPPY], ["x", "y"]) <= FIRST // 2
     with pytest.raises(ValueError, match="between its gaps: 600 samples were asked of at most 500"):
-        cut_windows(
-            [GAPPY], states=["x", "y"], inputs=[], n_windows=2, window=600,
-            rng=np.random.default_rng(0),
-        )  # fmt: skip
+        cut_windows([GAPPY], ep.lotka_volterra().model, n_windows=2, window=600, rng=0)
 
 
 @pytest.mark.slow

@@ -171,7 +171,7 @@ def test_windows_never_cross_trajectories_nor_overlap_where_there_is_room() -> N
     data = ep.Trajectory(t, np.stack([np.sin(t), np.cos(t)], axis=1), ["x", "y"])
     parts = [data.window(0, 1200), data.window(1200, 1250), data.window(1250, 3000)]
     rng = np.random.default_rng(0)
-    batch = cut_windows(parts, states=("x", "y"), inputs=(), n_windows=12, window=100, rng=rng)
+    batch = cut_windows(parts, PREY.model, n_windows=12, window=100, rng=rng)
     assert len(batch.start) == 12
     assert set(batch.trajectory) == {0, 2}
     for j in (0, 2):
@@ -179,9 +179,7 @@ def test_windows_never_cross_trajectories_nor_overlap_where_there_is_room() -> N
         assert start[-1] + 100 <= parts[j].n_samples
         assert (np.diff(start) >= 100).all()
     assert batch.multiplicity == 1.0
-    crowded = cut_windows(
-        [parts[0]], states=("x", "y"), inputs=(), n_windows=30, window=400, rng=rng
-    )
+    crowded = cut_windows([parts[0]], PREY.model, n_windows=30, window=400, rng=rng)
     assert crowded.multiplicity == pytest.approx(30 * 400 / 1200)
 
 

@@ -154,9 +154,9 @@ def test_what_refines_does_not_assess(monkeypatch: pytest.MonkeyPatch) -> None:
     batches: list[WindowBatch] = []
     pieces: list[list[ep.Trajectory]] = []
 
-    def seen(runs: list[ep.Trajectory], **settings: object) -> WindowBatch:
+    def seen(runs: list[ep.Trajectory], model: ep.SparseModel, **settings: object) -> WindowBatch:
         pieces.append(runs)
-        batches.append(cut_windows(runs, **settings))
+        batches.append(cut_windows(runs, model, **settings))
         return batches[-1]
 
     monkeypatch.setattr(systems, "cut_windows", seen)
@@ -196,10 +196,7 @@ def test_windows_without_a_jump_do_not_decide_alone(number: int) -> None:
 
 
 def batch_of(run: ep.Trajectory, *, n_windows: int = 3, window: int = 50) -> WindowBatch:
-    rng = np.random.default_rng(1)
-    return cut_windows(
-        [run], states=("x", "y"), inputs=(), n_windows=n_windows, window=window, rng=rng
-    )
+    return cut_windows([run], PREY.model, n_windows=n_windows, window=window, rng=1)
 
 
 def test_paths_of_several_models_are_smoothed_as_each_by_itself() -> None:

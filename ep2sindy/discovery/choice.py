@@ -20,7 +20,6 @@ from ep2sindy.data.gaps import mean_step
 from ep2sindy.data.trajectory import Trajectory, spread_blocks
 from ep2sindy.discovery.result import Discovery, DiscoveryMethod, NoiseTest
 from ep2sindy.estimation.noise import are_white
-from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Constraint, Relation, binding, constraint
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.regression.constrained import constrained_fit
@@ -28,7 +27,7 @@ from ep2sindy.regression.formulations import RandomSplit, Weak
 from ep2sindy.regression.front import Candidate, ParetoFront, Residual, fit_support
 from ep2sindy.regression.least_squares import LeastSquares
 from ep2sindy.regression.rows import RegressionRows
-from ep2sindy.regression.whitening import NEGLIGIBLE, whiten_rows
+from ep2sindy.regression.whitening import NEGLIGIBLE, whiten_terms
 from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.selection.criteria import Decision, cheapest_first, support_of
 
@@ -93,7 +92,12 @@ def choose(
         return replace(join_choice(won, best, model, method), noise_test=test, constraint=held)
     best = [front.best for front in scored]
     fits = [fit_last(*pair) for pair in zip(scored, best, strict=True)]
-    model = assemble_model(library, fits, units=units, provenance=provenance)
+    blocks = [fit.covariance for fit in fits if fit.covariance is not None]
+    # Errors of different equations are independent.
+    covariance = block_diag(*blocks) if len(blocks) == len(fits) else None
+    coef = coef_matrix(library, [fit.coef_by_term for fit in fits])
+    states = [fit.equation for fit in fits]
+    model = SparseModel(library, states, coef, units, provenance, covariance)
     test = NoiseTest({fit.equation: fit.left for fit in fits if fit.left is not None})
     return replace(join_choice(scored, best, model, method), noise_test=test)
 
@@ -258,25 +262,6 @@ def fit_last(front: ParetoFront, candidate: Candidate) -> Candidate:
     return candidate if front.rows.noisy is None else reweight(front.rows, candidate)
 
 
-def assemble_model(
-    library: Library,
-    fits: Sequence[Candidate],
-    *,
-    units: Mapping[str, str],
-    provenance: Mapping[str, str],
-) -> SparseModel:
-    """Join one fit per equation into a model, with errors independent between equations."""
-    blocks = [fit.covariance for fit in fits if fit.covariance is not None]
-    return SparseModel(
-        library=library,
-        states=[fit.equation for fit in fits],
-        coef=coef_matrix(library, [fit.coef_by_term for fit in fits]),
-        units=units,
-        provenance=provenance,
-        covariance=block_diag(*blocks) if len(blocks) == len(fits) else None,
-    )
-
-
 def reweight(
     problem: RegressionRows, candidate: Candidate, *, negligible: float = 0.0
 ) -> Candidate:
@@ -285,7 +270,7 @@ def reweight(
     If the residuals exceed the noise of the rows there is no covariance: intervals would not cover
     the truth. negligible: as for `whiten_rows`.
     """
-    theta, target, scale = whiten_terms(problem, candidate, negligible=negligible)
+    theta, target, scale = _whiten(problem, candidate, negligible=negligible)
     fit = LeastSquares.of_rows(theta, target)
     root = fit.root * scale[:, None]
     left = _compare_with_noise(target - theta @ fit.coef, target, n_free=len(scale))
@@ -298,28 +283,17 @@ def reweight(
     )
 
 
-def whiten_terms(
-    problem: RegressionRows,
-    candidate: Candidate,
-    *,
-    terms: Sequence[str] | None = None,
-    negligible: float = 0.0,
+def _whiten(
+    problem: RegressionRows, candidate: Candidate, *, negligible: float
 ) -> tuple[
     Float[np.ndarray, "rows terms"], Float[np.ndarray, " rows"], Float[np.ndarray, " terms"]
 ]:
-    """Columns and target of rows of variance 1 under a candidate, and the coefficients' scales.
-
-    terms: whose columns are wanted, at least the candidate's; None for just these.
-    """
-    names = candidate.terms if terms is None else tuple(terms)
-    order = [problem.library.index(name) for name in names]
-    scale = problem.coef_scale(0)
-    own, coef = np.isin(problem.library.names, candidate.terms), np.zeros(len(scale))
-    places = [problem.library.index(name) for name in candidate.terms]
-    coef[places] = candidate.coef / scale[places]
-    kept = np.isin(problem.library.names, names)
-    rows = whiten_rows(problem, own, coef, n_steps=N_STEPS, negligible=negligible, kept=kept)
-    return rows.theta[:, order], rows.target, scale[order]
+    """Columns and target of rows of variance 1 under a candidate, and the coefficients' scales."""
+    places = np.array([problem.library.index(name) for name in candidate.terms], dtype=np.int64)
+    scale = problem.coef_scale(0)[places]
+    coef = candidate.coef / scale
+    rows = whiten_terms(problem, places, coef, n_steps=N_STEPS, negligible=negligible)
+    return rows.theta[:, places], rows.target, scale
 
 
 def _test_fit(problem: RegressionRows, fit: Candidate, *, n_free: int) -> Residual:
@@ -329,7 +303,8 @@ def _test_fit(problem: RegressionRows, fit: Candidate, *, n_free: int) -> Residu
     not by coefficients that the data may contradict. n_free: number of free coefficients.
     """
     free = fit_support(problem, fit.equation, fit.terms)
-    theta, target, scale = whiten_terms(problem, free, terms=fit.terms, negligible=NEGLIGIBLE)
+    theta, target, scale = _whiten(problem, free, negligible=NEGLIGIBLE)
+    assert free.terms == fit.terms  # both are in the order of the library
     return _compare_with_noise(target - theta @ (fit.coef / scale), target, n_free=n_free)
 
 

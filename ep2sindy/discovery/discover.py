@@ -135,13 +135,18 @@ def discover(
     check_kind("method", method, DiscoveryMethod, "ep.Regression(selection=ep.EBIC())")
     task = DiscoveryProblem(trajectories, library, hidden)
     rng, watch = np.random.default_rng(seed), as_progress(progress)
-    together = shared or law is not None
-    if together:
+    if shared or law is not None:
         found = _discover_together(task, method, law, rng, watch)
     elif all(run.parameters == task.runs[0].parameters for run in task.runs):
         found = _discover_point((task, rng), method=method, progress=watch)
     else:
-        found = _discover_apart(task, method, workers or SURROUNDING, rng, watch)
+        points = _points_of(task)
+        streams, search = rng.spawn(len(points)), partial(_discover_point, method=method)
+        pairs = zip(points.values(), streams, strict=True)
+        pieces = [(replace(task, runs=own), stream) for own, stream in pairs]
+        stage = watch.stage(len(pieces), "point", "discovery")
+        apart = collect(workers or SURROUNDING, search, pieces, stage)
+        found = join_points(dict(zip(points, apart, strict=True)), values_of(points))
     return replace(found, data_warnings=(*found.data_warnings, *averaged))
 
 
@@ -157,22 +162,6 @@ def _hidden_names(hidden: Sequence[str] | int, taken: Sequence[str]) -> Sequence
 def _points_of(task: DiscoveryProblem) -> Mapping[str, Sequence[Trajectory]]:
     """The runs of every operating point, by its label."""
     return group_by_point(task.runs, [v for v in task.library.variables if v not in task.hidden])
-
-
-def _discover_apart(
-    task: DiscoveryProblem,
-    method: DiscoveryMethod,
-    workers: Workers,
-    rng: np.random.Generator,
-    progress: Progress,
-) -> Discovery:
-    """Each operating point alone, by the workers."""
-    points = _points_of(task)
-    tasks = [replace(task, runs=own) for own in points.values()]
-    pieces = list(zip(tasks, rng.spawn(len(tasks)), strict=True))
-    stage = progress.stage(len(pieces), "point", "discovery")
-    found = collect(workers, partial(_discover_point, method=method), pieces, stage)
-    return join_points(dict(zip(points, found, strict=True)), values_of(points))
 
 
 def _discover_together(

@@ -292,12 +292,8 @@ class Regression:
     @property
     def provenance(self) -> dict[str, str]:
         """Record in a model of how it was found."""
-        return {
-            "formulation": repr(self.formulation),
-            "search": repr(self.search),
-            "bootstraps": repr(self.bootstraps),
-            "selection": repr(self.selection),
-        }
+        names = ("formulation", "search", "bootstraps", "selection")
+        return {name: repr(getattr(self, name)) for name in names}
 
     def identify(
         self, task: DiscoveryProblem, *, rng: np.random.Generator, progress: Progress = SILENT

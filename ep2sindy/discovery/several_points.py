@@ -96,33 +96,23 @@ class PointsProblem:
         )  # fmt: skip
         fits, found = rows, None if law is None else choose_law(rows, law)
         if isinstance(self.method, TrajectorySearch):
-            fits = self._refine(rows, found, rng, progress)
+            start, runs = rows, list(self.points.values())
+            if found is not None:  # it averages the noise of the rows of all points
+                at = [dict(zip(self.parameters, p, strict=True)) for p in rows.points.tolist()]
+                start = replace(rows, models=[read_law(found, point) for point in at])
+            fits = fit_trajectories(start, runs, WINDOWS, seed=rng, progress=progress)
             found = None if law is None else choose_law(fits, law)
-        return join_points(
-            {
-                label: self._at_point(label, problems[label], fronts, fits, k)
-                for k, label in enumerate(self.points)
-            },
-            self.values,
-            found,
-        )
-
-    def _at_point(
-        self,
-        label: str,
-        problems: Sequence[RegressionRows],
-        fronts: Sequence[SharedFront],
-        fits: PointFits,
-        number: int,
-    ) -> Discovery:
-        model = fits.models[number]
-        own = [front.points[label] for front in fronts]
-        return replace(
-            join_choice(own, [front.best for front in own], model, self.regression),
-            model=replace(model, clock=self.points[label][0].clock),
-            ambiguities=tuple(dict.fromkeys(a for part in problems for a in ambiguities(part))),
-            constraint=fits.relations.at(fits.points[[number]])[0],
-        )
+        points: dict[str, Discovery] = {}
+        for k, (label, same_point) in enumerate(self.points.items()):
+            own = [front.points[label] for front in fronts]
+            alike = [each for part in problems[label] for each in ambiguities(part)]
+            points[label] = replace(
+                join_choice(own, [f.best for f in own], fits.models[k], self.regression),
+                model=replace(fits.models[k], clock=same_point[0].clock),
+                ambiguities=tuple(dict.fromkeys(alike)),
+                constraint=fits.relations.at(fits.points[[k]])[0],
+            )
+        return join_points(points, self.values, found)
 
     def _rows(
         self, rng: np.random.Generator, progress: Progress
@@ -146,24 +136,6 @@ class PointsProblem:
             parameters=self.parameters,
         )
 
-    def _refine(
-        self,
-        rows: PointFits,
-        law: OperatingLaw | None,
-        rng: np.random.Generator,
-        progress: Progress,
-    ) -> PointFits:
-        """Coefficients by the trajectories of each point, from those that its rows gave.
-
-        A law starts all points, since it averages the noise of their rows.
-        """
-        start = rows
-        if law is not None:
-            at = [dict(zip(self.parameters, each, strict=True)) for each in rows.points.tolist()]
-            start = replace(rows, models=[read_law(law, point) for point in at])
-        runs = list(self.points.values())
-        return fit_trajectories(start, runs, WINDOWS, seed=rng, progress=progress)
-
 
 def choose_law(fits: PointFits, law: LawFunctions | Sequence[LawFunctions]) -> OperatingLaw:
     """The law through the fits of all points, of several the one that errs least where left out.
@@ -173,14 +145,8 @@ def choose_law(fits: PointFits, law: LawFunctions | Sequence[LawFunctions]) -> O
     """
     if isinstance(law, int | str | Library):
         return fits.law(fits.functions(law))
-    laws, reasons = [], ["law=[...] must name degrees or functions"]
-    for each in law:
-        try:
-            functions = fits.functions(each)
-            laws.append((functions, fits.rate_errors(functions)))
-        except ValueError as error:
-            reasons.append(str(error))
-    if not laws:
-        raise ValueError(reasons[-1])
-    best = fewest_of_least([(errors, len(functions)) for functions, errors in laws])
-    return fits.law(laws[best][0])
+    tested, reasons = fits.test_laws(law)
+    if not tested:
+        raise ValueError(["law=[...] must name degrees or functions", *reasons][-1])
+    best = fewest_of_least([(errors, len(functions)) for functions, errors in tested])
+    return fits.law(tested[best][0])

@@ -16,7 +16,7 @@ from ep2sindy.regression.gram_kernels import ROUNDING, independent_terms
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.searches import BestSubset
 from ep2sindy.runtime.progress import Progress, count_pieces
-from ep2sindy.selection.criteria import EBIC, Selection
+from ep2sindy.selection.criteria import EBIC
 
 Problems = Mapping[str, Sequence[RegressionRows]]  # point -> rows of every equation
 
@@ -83,8 +83,17 @@ def search_shared(
         )
         for k, equation in count_pieces(progress, equations, "equation", "search of all points")
     ]
-    scores = _summed_scores(fronts, method.selection, list(problems), task)
-    return [front.with_scores(own) for front, own in zip(fronts, scores, strict=True)]
+    rule, nothing = method.selection, np.zeros((1, len(task.library)), dtype=np.bool_)
+    rule = rule.shared_by(len(problems)) if isinstance(rule, EBIC) else rule
+    by_point = [rule.decide([front.points[p] for front in fronts], task).scores for p in problems]
+    scored = []
+    for front, own in zip(fronts, zip(*by_point, strict=True), strict=True):
+        scores = np.sum(own, axis=0)
+        (kept,) = task.complete(front.equation, [nothing])
+        if kept.any(axis=1).all():  # what is known puts terms into every support
+            scores[0] = np.inf
+        scored.append(front.with_scores(scores))
+    return scored
 
 
 def _shared_front(
@@ -137,20 +146,3 @@ def _keep_determined(
         columns = np.flatnonzero(mask)
         mask[columns] = independent_terms(problem.train_gram.xx[np.ix_(columns, columns)])
     return found
-
-
-def _summed_scores(
-    fronts: Sequence[SharedFront],
-    selection: Selection,
-    points: Sequence[str],
-    task: DiscoveryProblem,
-) -> list[Float[np.ndarray, " supports"]]:
-    rule = selection.shared_by(len(points)) if isinstance(selection, EBIC) else selection
-    by_point = [rule.decide([front.points[p] for front in fronts], task).scores for p in points]
-    summed = [np.sum(scores, axis=0) for scores in zip(*by_point, strict=True)]
-    for front, scores in zip(fronts, summed, strict=True):
-        nothing = np.zeros((1, len(task.library)), dtype=np.bool_)
-        (kept,) = task.complete(front.equation, [nothing])
-        if kept.any(axis=1).all():  # what is known puts terms into every support
-            scores[0] = np.inf
-    return summed

@@ -25,6 +25,7 @@ from ep2sindy.library.relations import Constraint, Relation, constraint
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.storage import covariance_in, names_in, read_as, read_stored, texts_in
 from ep2sindy.operating.records import check_varying, read_points
+from ep2sindy.regression.constrained import place_coefficients
 from ep2sindy.regression.pooled import Basis
 from ep2sindy.runtime.files import write_text
 from ep2sindy.runtime.values import read_only
@@ -190,13 +191,9 @@ class OperatingLaw:
             )
         functions = self.functions.evaluate(values[None])[0]
         at_point = self.coef @ functions
-        rows = [self.library.index(term) for _, term in self.coefficients]
-        columns = [self.states.index(state) for state, _ in self.coefficients]
-        coef, covariance = np.zeros((len(self.library), len(self.states))), None
-        coef[rows, columns] = at_point
+        coef, used = place_coefficients(self.library, self.states, self.coefficients, at_point)
+        covariance = None
         if self.covariance is not None:
-            order = np.lexsort([rows, columns])
-            used = order[at_point[order] != 0.0]
             spread = np.kron(np.eye(len(at_point)), functions)[used]
             covariance = spread @ self.covariance @ spread.T
         where = label if inside else f"{label}, extrapolated"
@@ -459,12 +456,6 @@ def law_of_constraint(relations: Constraint, parameters: Sequence[str]) -> LawCo
         D=relations.d[:, None],
         texts=(),
     )
-
-
-def read_coefficients(model: SparseModel, constraint: Constraint) -> Float[np.ndarray, " coefs"]:
-    """Coefficients of a model in the order of the constraint's."""
-    index, states = model.library.index, model.states.index
-    return np.array([model.coef[index(term), states(s)] for s, term in constraint.coefficients])
 
 
 def _text(state: str, term: str, factors: Mapping[str, float]) -> str:

@@ -73,15 +73,7 @@ def window_errors(
     constant errs by about one, and so does by convention a model that blows up.
     """
     window = dominant_window([run], models[0].states, periods=periods)
-    batch = cut_windows(
-        [run],
-        states=models[0].states,
-        inputs=models[0].inputs,
-        n_windows=N_WINDOWS,
-        window=window,
-        rng=0,
-        courses=models[0].courses,
-    )
+    batch = cut_windows([run], models[0], n_windows=N_WINDOWS, window=window, rng=0)
     method = MultipleShooting(step=FusedRungeKutta(N_SUBSTEPS))
     paths = smooth_batch(models, batch, method=method)
     squares = np.square(paths - batch.data).mean(axis=(2, 3))

@@ -17,18 +17,12 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library, named_terms, polynomial
 from ep2sindy.library.relations import Constraint
 from ep2sindy.model.model import SparseModel
-from ep2sindy.operating.law import (
-    LawConstraint,
-    LawFunctions,
-    OperatingLaw,
-    make_basis,
-    read_coefficients,
-)
+from ep2sindy.operating.law import LawConstraint, LawFunctions, OperatingLaw, make_basis
 from ep2sindy.refinement.assess import RefinementStatus
 from ep2sindy.refinement.problem import RefinementSettings
 from ep2sindy.refinement.refine import Refinement, refine
-from ep2sindy.regression.constrained import solve_constrained
-from ep2sindy.regression.pooled import invert_covariance, pool_rows, root_of
+from ep2sindy.regression.constrained import read_coefficients, solve_constrained
+from ep2sindy.regression.pooled import invert_covariance, pool_rows, residuals_left_out, root_of
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.runtime.progress import SILENT, Progress
 
@@ -97,18 +91,23 @@ class PointFits:
         sets = [[*chain(*more)] for more in product(*own)] if len(names) <= MANY else [[]]
         candidates = [named_terms(names, ["1", *names, *more]) for more in sets]
         candidates.append(polynomial(names, degree=2))
-        best, least, reason = None, np.inf, ""
-        for functions in candidates:
+        tested, reasons = self.test_laws(candidates)
+        if not tested:
+            raise ValueError(reasons[0])
+        return min(tested, key=lambda law: np.square(law[1]).mean())[0]
+
+    def test_laws(
+        self, laws: Sequence[LawFunctions]
+    ) -> tuple[list[tuple[Library, Float[np.ndarray, " points"]]], list[str]]:
+        """The functions and `rate_errors` of each law, and why other laws have too few points."""
+        tested, reasons = [], []
+        for law in laws:
             try:
-                error = float(np.square(self.rate_errors(functions)).mean())
-            except ValueError as problem:  # the points do not suffice for these
-                reason = reason or str(problem)
-                continue
-            if error < least:
-                best, least = functions, error
-        if best is None:
-            raise ValueError(reason)
-        return best
+                functions = self.functions(law)
+                tested.append((functions, self.rate_errors(functions)))
+            except ValueError as error:
+                reasons.append(str(error))
+        return tested, reasons
 
     def columns(self, functions: Library) -> Float[np.ndarray, "points variables"]:
         """The parameters of the points in the order of the functions' variables."""
@@ -127,7 +126,7 @@ class PointFits:
         free, covariance, errors = self._pool(functions), None, None
         with suppress(ValueError):  # too few points to leave one out
             errors = self.rate_errors(functions)
-            laws = self._laws_without_each(functions)
+            laws = np.stack([self._pool(functions, without=k) for k in range(len(self.models))])
             apart = (laws - laws.mean(axis=0)).reshape(len(laws), -1)
             covariance = (len(laws) - 1) / len(laws) * apart.T @ apart
         columns = self.columns(functions)
@@ -153,21 +152,16 @@ class PointFits:
         Raises ValueError if the points do not suffice for a law without each of them.
         """
         basis = make_basis(functions, self.columns(functions), n_spare=1)
-        missed = pool_rows(self._rows, basis, self._size).left_out(self._rows, basis)
+        missed = residuals_left_out(self._rows, basis, self._size)
         pairs = zip(missed, self._rows, strict=True)
         return np.array([norm(off) / norm(y) if y.any() else 1.0 for off, (_, y) in pairs])
-
-    def _laws_without_each(self, functions: Library) -> Float[np.ndarray, "points free functions"]:
-        """The factors of the law without each point."""
-        make_basis(functions, self.columns(functions), n_spare=1)
-        return np.stack([self._pool(functions, without=k) for k in range(len(self.models))])
 
     def _pool(
         self, functions: Library, *, without: int | None = None
     ) -> Float[np.ndarray, "free functions"]:
         kept = [k for k in range(len(self.models)) if k != without]
         basis = make_basis(functions, self.columns(functions)[kept])
-        return pool_rows([self._rows[k] for k in kept], basis, self._size).law
+        return pool_rows([self._rows[k] for k in kept], basis, self._size)
 
     @cached_property
     def _size(self) -> Float[np.ndarray, " free"]:

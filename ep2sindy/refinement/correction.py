@@ -196,7 +196,7 @@ def _result(
         model=with_coef(model, equations.relations, equations.coef(scaling))[0],
         correction=(term.inner if trained else deepcopy(correction)).to("cpu", torch.float64),
         scale=batch.scale,
-        rate=float(term.rate) * size / batch.step_s,
+        rate=term.rate * size / batch.step_s,
         loss_before=loss_before if np.isfinite(loss_before) else float("inf"),
         loss=float(window_loss.mean()) if trained else float("inf"),
         window_loss=window_loss,
@@ -210,15 +210,13 @@ def _result(
 class _Scaled(nn.Module):
     """Correction times a typical rate, so that its output and weights are of order one."""
 
-    rate: torch.Tensor
-
     def __init__(self, inner: nn.Module, rate: float) -> None:
         super().__init__()
-        self.inner = inner
-        self.register_buffer("rate", torch.tensor(rate, dtype=torch.float64))
+        self.inner, self.rate = inner, rate
 
     def forward(self, values: torch.Tensor) -> torch.Tensor:
-        return self.rate * self.inner(values)
+        scaled: torch.Tensor = self.rate * self.inner(values)
+        return scaled
 
 
 def _typical_rate(known: ScaledEquations, batch: WindowBatch) -> float:

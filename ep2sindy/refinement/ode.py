@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -16,6 +16,7 @@ from ep2sindy.library.relations import Constraint
 from ep2sindy.library.relations import constraint as build_constraint
 from ep2sindy.library.terms import Term
 from ep2sindy.model.model import SparseModel
+from ep2sindy.regression.constrained import read_coefficients
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,10 +30,10 @@ class Drive:
 
     steps: torch.Tensor
     inputs: torch.Tensor
-    _uniform: bool = field(init=False)
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "_uniform", bool((self.steps == 1.0).all()))
+    @cached_property
+    def _uniform(self) -> bool:
+        return bool((self.steps == 1.0).all())
 
     def at(self, t: torch.Tensor | float) -> tuple[torch.Tensor | None, torch.Tensor]:
         """Steps (points, 1, batch), or None if all are one, and inputs (points, n_inputs, batch).
@@ -303,12 +304,7 @@ def _coef(model: SparseModel, relations: Constraint) -> np.ndarray:
     for state, _ in relations.coefficients:
         if state not in model.states:
             raise ValueError(f"unknown state {state!r}; this model has {list(model.states)}")
-    coef = np.array(
-        [
-            model.coef[model.library.index(n), model.states.index(s)]
-            for s, n in relations.coefficients
-        ]
-    )
+    coef = read_coefficients(model, relations)
     still = [relations.coefficients[i] for i in np.asarray(relations.free) if coef[i] == 0.0]
     if still:
         raise ValueError(

@@ -129,15 +129,7 @@ class RefinementSettings:
             ]
             window = min(lengths, default=0)
         return [
-            cut_windows(
-                runs,
-                states=model.states,
-                inputs=model.inputs,
-                n_windows=self.n_windows,
-                window=window,
-                rng=rng,
-                courses=model.courses,
-            )
+            cut_windows(runs, model, n_windows=self.n_windows, window=window, rng=rng)
             for model, runs in zip(models, trajectories, strict=True)
         ]
 

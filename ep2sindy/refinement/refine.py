@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Unpack, cast, overload
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from ep2sindy.data.runs import Runs, is_run, trajectories_of
 from ep2sindy.data.trajectory import Trajectory
@@ -34,6 +34,7 @@ from ep2sindy.refinement.problem import (
     record,
 )
 from ep2sindy.refinement.windows import WindowBatch
+from ep2sindy.regression.constrained import place_coefficients
 from ep2sindy.runtime.progress import Advance, Progress, as_progress, nothing
 from ep2sindy.runtime.screen import N_LINES, one_screen
 from ep2sindy.runtime.threads import one_thread
@@ -198,10 +199,16 @@ def refine(
     with as_progress(progress).stage(None, "iteration", "refinement") as advance:
         refinements: list[Refinement] = []
         for some in _chunks(len(models), points_per_batch):
-            refinements += _refine(
-                models[some], batches[some], relations[some], settings=settings,
-                callback=callback, device=device, advance=advance,
+            history, observe = record(callback, advance)
+            problem = RefinementProblem.of(
+                models[some], batches[some], relations[some], free_start=settings.free_start,
+                n_reweights=settings.n_reweights, observe=observe, device=device,
             )  # fmt: skip
+            fit, verdicts = fit_and_assess(problem, settings.method or MultipleShooting())
+            refinements += [
+                _result(one, problem, fit, p, verdict, history)
+                for p, (one, verdict) in enumerate(zip(models[some], verdicts, strict=True))
+            ]
     return refinements[0] if isinstance(model, SparseModel) else refinements
 
 
@@ -241,34 +248,6 @@ def _resolve_constraints(
             f"{'' if settings.constraint is None else ', next to a common one; leave out one'}"
         )
     return constraints
-
-
-def _refine(
-    models: Sequence[SparseModel],
-    batches: Sequence[WindowBatch],
-    relations: Sequence[Constraint | None],
-    *,
-    settings: RefinementSettings,
-    callback: Callable[[Iteration], None] | None,
-    device: str,
-    advance: Advance,
-) -> list[Refinement]:
-    """Refine one batch of points on their windows."""
-    history, observe = record(callback, advance)
-    problem = RefinementProblem.of(
-        models,
-        batches,
-        relations,
-        free_start=settings.free_start,
-        n_reweights=settings.n_reweights,
-        observe=observe,
-        device=device,
-    )
-    fit, verdicts = fit_and_assess(problem, settings.method or MultipleShooting())
-    return [
-        _result(model, problem, fit, p, verdict, history)
-        for p, (model, verdict) in enumerate(zip(models, verdicts, strict=True))
-    ]
 
 
 def _chunks(n_models: int, points_per_batch: int) -> list[slice]:
@@ -323,16 +302,11 @@ def _doubt(model: SparseModel, verdict: RefinementVerdict) -> str:
 
 def with_coef(
     model: SparseModel, constraint: Constraint, values: np.ndarray
-) -> tuple[SparseModel, list[int]]:
+) -> tuple[SparseModel, Int[np.ndarray, " used"]]:
     """Model with these coefficients, and their indices in `values` in the model's own order."""
-    coef = np.zeros_like(model.coef)
-    places = {}
-    for k, (state, term) in enumerate(constraint.coefficients):
-        equation, row = model.states.index(state), model.library.index(term)
-        coef[row, equation] = values[k]
-        if values[k] != 0.0:
-            places[equation, row] = k
-    return replace(model, coef=coef, covariance=None), [places[at] for at in sorted(places)]
+    places = constraint.coefficients
+    coef, used = place_coefficients(model.library, model.states, places, values)
+    return replace(model, coef=coef, covariance=None), used
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -14,30 +13,6 @@ from ep2sindy.model.flow_kernels import advance, sums_of_products
 from ep2sindy.model.runge_kutta import THREE_EIGHTHS
 from ep2sindy.refinement.ode import ODE
 from ep2sindy.runtime.values import set_counts
-
-
-@runtime_checkable
-class Step(Protocol):
-    """Interface of the step schemes.
-
-    ode: with its scalings set, and a drive of one segment over a batch of (windows * segments).
-    nodes: (points, windows, samples, n_states).
-    """
-
-    def maps(self, ode: ODE, nodes: np.ndarray, *, by_scaling: bool = True) -> np.ndarray:
-        """End of each step and its derivatives, in the layout of the kernels.
-
-        by_scaling: False leaves out the derivatives by the scalings.
-        """
-        ...
-
-    def finer(self, ode: ODE, nodes: np.ndarray) -> np.ndarray:
-        """End of each step, taken as two half steps: (points, windows, segments, n_states)."""
-        ...
-
-    def halved(self) -> Step | None:
-        """Scheme with twice as many steps; None if there is none."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -63,6 +38,12 @@ class RungeKutta:
         set_counts(self, {"n_substeps": 1})
 
     def maps(self, ode: ODE, nodes: np.ndarray, *, by_scaling: bool = True) -> np.ndarray:
+        """End of each step and its derivatives, in the layout of the kernels.
+
+        ode: with its scalings set, and a drive of one segment over a batch of (windows * segments).
+        nodes: (points, windows, samples, n_states). by_scaling: False leaves out the derivatives by
+        the scalings.
+        """
         x = _batch(nodes[:, :, :-1], ode)
         z = x.new_zeros((len(x), _n_columns(ode, by_scaling=by_scaling), *x.shape[1:]))
         z[:, 0] = x
@@ -73,13 +54,11 @@ class RungeKutta:
         return _as_maps(end, nodes)
 
     def finer(self, ode: ODE, nodes: np.ndarray) -> np.ndarray:
+        """End of each step, taken as two half steps: (points, windows, segments, n_states)."""
         x = _batch(nodes[:, :, :-1], ode)
         with torch.inference_mode():
             end = integrate(ode, x[:, None], n_substeps=2 * self.n_substeps)[-1, :, 0]
         return end.permute(0, 2, 1).cpu().numpy().reshape(nodes[:, :, 1:].shape)
-
-    def halved(self) -> RungeKutta | None:
-        return RungeKutta(2 * self.n_substeps) if self.n_substeps < 8 else None
 
 
 ONE_RUNGE_KUTTA = RungeKutta()
@@ -123,17 +102,16 @@ class FusedRungeKutta:
         set_counts(self, {"n_substeps": 1})
 
     def maps(self, ode: ODE, nodes: np.ndarray, *, by_scaling: bool = True) -> np.ndarray:
+        """As `RungeKutta.maps`."""
         maps = np.zeros((*nodes[:, :, 1:].shape, _n_columns(ode, by_scaling=by_scaling)))
         slopes = maps.reshape(len(maps), -1, *maps.shape[3:])
         maps[..., -1] = self._ends(ode, nodes, self.n_substeps, slopes)
         return maps
 
     def finer(self, ode: ODE, nodes: np.ndarray) -> np.ndarray:
+        """As `RungeKutta.finer`."""
         none = np.empty((len(nodes), nodes[0, :, 1:, 0].size, ode.n_states, 0))
         return self._ends(ode, nodes, 2 * self.n_substeps, none)
-
-    def halved(self) -> FusedRungeKutta | None:
-        return FusedRungeKutta(2 * self.n_substeps) if self.n_substeps < 8 else None
 
     def _ends(self, ode: ODE, nodes: np.ndarray, n_substeps: int, slopes: np.ndarray) -> np.ndarray:
         """Ends of the steps, (points, windows, segments, n_states); derivatives go to `slopes`.
@@ -157,6 +135,14 @@ class FusedRungeKutta:
         return ends.reshape(nodes[:, :, 1:].shape)
 
 
+Step = RungeKutta | FusedRungeKutta
+
+
+def halved(step: Step) -> Step | None:
+    """The scheme with twice as many steps; None if there is none."""
+    return replace(step, n_substeps=2 * step.n_substeps) if step.n_substeps < 8 else None
+
+
 def fastest_step(library: Library) -> Step:
     """The scheme for many models of one library: the fused one, unless it has functions."""
     return RungeKutta() if library.functions else FusedRungeKutta()
@@ -173,6 +159,6 @@ def _batch(nodes: np.ndarray, ode: ODE) -> torch.Tensor:
 
 
 def _as_maps(end: torch.Tensor, nodes: np.ndarray) -> np.ndarray:
-    """The layout of `Step.maps` for (points, columns, n_states, batch), the ends first."""
+    """The layout of `RungeKutta.maps` for (points, columns, n_states, batch), the ends first."""
     columns = end.roll(-1, dims=1).permute(0, 3, 2, 1).contiguous()
     return columns.cpu().numpy().reshape(*nodes[:, :, 1:].shape, -1)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -12,6 +12,7 @@ from ep2sindy.data.gaps import between_gaps, mean_step
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.model.inputs import curve_through
+from ep2sindy.model.model import SparseModel
 from ep2sindy.runtime.values import locked
 from ep2sindy.signals.spectrum import dominant_frequency, power_spectrum, steps_in
 
@@ -67,27 +68,29 @@ class WindowBatch:
 
 def cut_windows(
     trajectories: Sequence[Trajectory],
+    model: SparseModel,
     *,
-    states: Sequence[str],
-    inputs: Sequence[str],
     n_windows: int,
     window: int,
     rng: np.random.Generator | int,
-    courses: Mapping[str, str] | None = None,
 ) -> WindowBatch:
     """Cut `n_windows` windows of `window` samples; fewer if there are not that many positions.
 
     No window crosses a gap (a step of over ten median steps), unless every position does.
-    courses: of the inputs, as in a SparseModel.
+    model: whose states and inputs are cut, with the courses of its inputs.
     Raises ValueError for no trajectory, a window longer than every trajectory or of under five
     samples, or a missing variable.
     """
     rng = np.random.default_rng(rng)
     check_windows(n_windows, window)
-    _check_room(trajectories, window)
-    values = [trajectory.columns([*states, *inputs]) for trajectory in trajectories]
-    joined = np.concatenate(values)
-    n = len(states)
+    longest = _longest(trajectories)
+    if window > longest:
+        raise ValueError(
+            f"a window must fit into a trajectory, between its gaps: {window} samples were asked "
+            f"of at most {longest}; shorten it, or leave it out to have it chosen"
+        )
+    values = [run.columns([*model.states, *model.inputs]) for run in trajectories]
+    joined, n = np.concatenate(values), len(model.states)
     spread, rms = joined[:, :n].std(axis=0), np.sqrt(np.square(joined[:, n:]).mean(axis=0))
     scale = zero_to_one(np.append(spread, rms))
     step_s = mean_step(*(each.t for each in trajectories))
@@ -97,7 +100,7 @@ def cut_windows(
     lengths = (segments[:, 2] - segments[:, 1]).tolist()
     piece, start = _places(lengths, n_windows, window, rng)
     index, start = segments[piece, 0], start + segments[piece, 1]
-    known = [(courses or {}).get(name) for name in inputs]
+    known = [model.courses.get(name) for name in model.inputs]
     cubics = [
         curve_through(each.t, v[:, n:] / scale[n:], known).pieces.transpose(1, 0, 2)
         for each, v in zip(trajectories, values, strict=True)
@@ -156,15 +159,6 @@ def _longest(trajectories: Sequence[Trajectory]) -> int:
     if not trajectories:
         raise ValueError("refinement needs at least one trajectory, got none")
     return max(stop - start for run in trajectories for start, stop in between_gaps(run.t))
-
-
-def _check_room(trajectories: Sequence[Trajectory], window: int) -> None:
-    longest = _longest(trajectories)
-    if window > longest:
-        raise ValueError(
-            f"a window must fit into a trajectory, between its gaps: {window} samples were asked "
-            f"of at most {longest}; shorten it, or leave it out to have it chosen"
-        )
 
 
 def _places(

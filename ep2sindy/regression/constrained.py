@@ -10,14 +10,14 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ep2sindy.library.library import Library
-from ep2sindy.library.relations import Constraint
-from ep2sindy.model.model import SparseModel, coef_matrix
+from ep2sindy.library.relations import Constraint, Place
+from ep2sindy.model.model import SparseModel
 from ep2sindy.model.scores import r2
 from ep2sindy.regression.bootstraps import Resamples
 from ep2sindy.regression.gram_kernels import invert_gram
 from ep2sindy.regression.least_squares import LeastSquares
 from ep2sindy.regression.rows import RegressionRows
-from ep2sindy.regression.whitening import WhitenedRows, whiten_rows
+from ep2sindy.regression.whitening import whiten_terms
 
 # Lower bound on the residual, as a fraction of the target's RMS; it limits the weight of an
 # equation with an exact fit.
@@ -116,19 +116,34 @@ class ConstrainedSolution:
         root: Float[np.ndarray, "coefs _"] | None = None,
     ) -> SparseModel:
         """The model of these coefficients. root: of their covariance; None takes `root`."""
-        names, states = self.constraint.coefficients, self.constraint.states
-        coef = self.constraint.coef(self.fit.coef)
-        columns = [states.index(s) for s, _ in names]
-        order = np.lexsort([[library.index(t) for _, t in names], columns])
-        own = (self.root if root is None else root)[order[coef[order] != 0.0]]
-        return SparseModel(
-            library=library,
-            states=states,
-            coef=coef_matrix(library, [*self.constraint.equations(self.fit.coef).values()]),
-            units=units,
-            provenance=provenance,
-            covariance=own @ own.T,
-        )
+        held = self.constraint
+        values = held.coef(self.fit.coef)
+        coef, used = place_coefficients(library, held.states, held.coefficients, values)
+        own = (self.root if root is None else root)[used]
+        return SparseModel(library, held.states, coef, units, provenance, own @ own.T)
+
+
+def place_coefficients(
+    library: Library,
+    states: Sequence[str],
+    places: Sequence[Place],
+    values: Float[np.ndarray, " coefs"],
+) -> tuple[Float[np.ndarray, "terms states"], Int[np.ndarray, " used"]]:
+    """The matrix of coefficients of (state, term), and the order in which a model has them.
+
+    The order holds the indices of those that are not zero, as for the covariance of a SparseModel.
+    """
+    rows = np.array([library.index(term) for _, term in places], dtype=np.int64)
+    columns = np.array([states.index(state) for state, _ in places], dtype=np.int64)
+    coef, order = np.zeros((len(library), len(states))), np.lexsort([rows, columns])
+    coef[rows, columns] = values
+    return coef, order[values[order] != 0.0]
+
+
+def read_coefficients(model: SparseModel, constraint: Constraint) -> Float[np.ndarray, " coefs"]:
+    """Coefficients of a model in the order of the constraint's."""
+    index, states = model.library.index, model.states.index
+    return np.array([model.coef[index(term), states(s)] for s, term in constraint.coefficients])
 
 
 def fit_draws(
@@ -177,18 +192,10 @@ class WeightedEquation:
         """Terms and target, weighted so that residuals have variance 1 for these coefficients."""
         scale = self.problem.coef_scale(self.number)[self.terms]
         if self.problem.noisy is not None:
-            white = _whiten(self.problem, self.terms, coef / scale, n_steps=0)
+            white = whiten_terms(self.problem, self.terms, coef / scale, n_steps=0)
             return white.theta[:, self.terms] / scale, white.target
         theta = self.problem.train_theta[:, self.terms] / self.std
         return theta / scale, self.problem.scaled_target(self.number) / self.std
-
-
-def _whiten(
-    problem: RegressionRows, terms: np.ndarray, coef: np.ndarray, *, n_steps: int
-) -> WhitenedRows:
-    mask, full = np.zeros(len(problem.library), dtype=np.bool_), np.zeros(len(problem.library))
-    mask[terms], full[terms] = True, coef
-    return whiten_rows(problem, mask, full, n_steps=n_steps, kept=mask)
 
 
 def weigh_equations(
@@ -217,7 +224,7 @@ def _fit_alone(
     variance = fit.squares / max(len(target) - len(terms), 1)
     least = MIN_RESIDUAL**2 * np.square(target).mean()
     if problem.noisy is not None:
-        white = _whiten(problem, terms, fit.coef, n_steps=8)
+        white = whiten_terms(problem, terms, fit.coef, n_steps=8)
         problem = replace(problem, noisy=replace(problem.noisy, smoothed=white.corrected))
         fit = LeastSquares.of_rows(white.theta[:, terms], white.target)
     return WeightedEquation(

@@ -14,7 +14,7 @@ from ep2sindy.model.scores import r2_of
 from ep2sindy.regression.bootstraps import Supports
 from ep2sindy.regression.gram_kernels import explained_squares, fit_masks
 from ep2sindy.regression.least_squares import Blocks, fit_masks_to_rows, sum_residuals
-from ep2sindy.regression.rows import Grams, RegressionRows
+from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.runtime.screen import html_table, one_screen, text_table
 from ep2sindy.runtime.values import check_count
 
@@ -237,7 +237,16 @@ def pareto_front(problem: RegressionRows, supports: Supports, *, depth: int = 1)
     better than the true one of the same size; a depth of 3 keeps both for a later selection.
     """
     depth, sizes = check_count("depth", depth), supports.masks.sum(axis=1)
-    explained, best = _rank(problem, supports, depth)
+    equation, train = problem.equations.index(supports.equation), problem.train_gram
+    assess = problem.test_gram if problem.test.any() else train
+    # From Gram matrices only: what each support takes of the target's sum of squares; NaN for
+    # linearly dependent terms.
+    coef = fit_masks(train.xx, train.xy[equation], supports.masks)
+    explained = explained_squares(coef, assess.xx, assess.xy[equation])
+    order = np.lexsort((-explained, sizes))
+    order = order[np.isfinite(explained[order]) & (sizes[order] > 0)]
+    rank = np.arange(len(order)) - np.searchsorted(sizes[order], sizes[order])
+    best = order[rank < depth]
     empty = np.zeros((1, len(problem.library)), dtype=np.bool_)
     chosen = Supports(
         equation=supports.equation,
@@ -246,9 +255,13 @@ def pareto_front(problem: RegressionRows, supports: Supports, *, depth: int = 1)
         inclusion=supports.inclusion,
     )
     found = _fit(problem, chosen)
-    order = order_front(np.append(0, sizes[best]), errors_of(found), depth=depth)
-    ensemble = _ensemble(problem, supports, explained)
-    return ParetoFront(supports.equation, [found[k] for k in order], problem, ensemble)
+    kept = order_front(np.append(0, sizes[best]), errors_of(found), depth=depth)
+    # The sum of squares about the mean is not zero here: `r2_of` would have raised before.
+    spread = _squares_about_mean(problem, equation, test=assess is not train)
+    errors = (assess.yy[equation] - explained) / spread
+    fitted = np.isfinite(errors)
+    ensemble = Ensemble(sizes[fitted], errors[fitted])
+    return ParetoFront(supports.equation, [found[k] for k in kept], problem, ensemble)
 
 
 def order_front(
@@ -265,43 +278,6 @@ def order_front(
             lowest = errors[ranked[0]]
             front += ranked
     return front
-
-
-def _rank(
-    problem: RegressionRows, supports: Supports, depth: int
-) -> tuple[Float[np.ndarray, " supports"], Int[np.ndarray, " best"]]:
-    """Reduction of the target's sum of squares by each support, on the rows used for scoring.
-
-    Computed from Gram matrices only; NaN for linearly dependent terms. And the indices of the
-    `depth` supports that reduce it most of each size, ordered by size.
-    """
-    equation, sizes = problem.equations.index(supports.equation), supports.masks.sum(axis=1)
-    train, assess = problem.train_gram, _assessing_gram(problem)
-    coef = fit_masks(train.xx, train.xy[equation], supports.masks)
-    explained = explained_squares(coef, assess.xx, assess.xy[equation])
-    order = np.lexsort((-explained, sizes))
-    order = order[np.isfinite(explained[order]) & (sizes[order] > 0)]
-    rank = np.arange(len(order)) - np.searchsorted(sizes[order], sizes[order])
-    return explained, order[rank < depth]
-
-
-def _assessing_gram(problem: RegressionRows) -> Grams:
-    """Gram matrices of the held-out rows, or of the training rows if none are held out."""
-    return problem.test_gram if problem.test.any() else problem.train_gram
-
-
-def _ensemble(
-    problem: RegressionRows, supports: Supports, explained: Float[np.ndarray, " supports"]
-) -> Ensemble:
-    """Sizes and errors of all supports.
-
-    The sum of squares about the mean is not zero here: `r2_of` would have raised before.
-    """
-    equation = problem.equations.index(supports.equation)
-    spread = _squares_about_mean(problem, equation, test=bool(problem.test.any()))
-    errors = (_assessing_gram(problem).yy[equation] - explained) / spread
-    fitted = np.isfinite(errors)
-    return Ensemble(supports.masks.sum(axis=1)[fitted], errors[fitted])
 
 
 def _fit(problem: RegressionRows, supports: Supports) -> list[Candidate]:

@@ -106,68 +106,54 @@ def fewest_of_least(trials: Sequence[tuple[Float[np.ndarray, " points"], int]]) 
     return min(near, key=lambda k: (trials[k][1], means[k]))
 
 
-@dataclass(frozen=True, eq=False)
-class PooledFit:
-    """A law fitted by `pool_rows`: `fit` of the unknowns, and their matrix `to_law`.
-
-    size: of the coefficients, in which the unknowns are.
-    """
-
-    fit: LeastSquares
-    size: Float[np.ndarray, " coefs"]
-    to_law: Float[np.ndarray, "unknowns unknowns"]
-    n_functions: int
-
-    def left_out(
-        self, rows: Sequence[tuple[np.ndarray, np.ndarray]], basis: Basis
-    ) -> list[Float[np.ndarray, " _"]]:
-        """Residuals of every point's rows by the law of the other points.
-
-        They are (1 - H_p)^-1 r_p, with r_p the residuals of the point in the fit of all points and
-        H_p its block of the hat matrix.
-        Raises ValueError if a point is indispensable: without it the others do not tell the
-        functions apart.
-        """
-        found = []
-        for (theta, y), q in zip(rows, basis.orthonormal, strict=True):
-            block = np.kron(theta * self.size, q[None])
-            hat = block @ self.fit.root
-            kept = np.eye(len(y)) - hat @ hat.T
-            if np.linalg.eigvalsh(kept).min(initial=1.0) < 1.0 - FULL_LEVERAGE:
-                raise ValueError(
-                    "a law that is tested by leaving out points must not hang on one of them: "
-                    "without it the others do not tell its functions apart; add points, or take a "
-                    "law of fewer functions"
-                )
-            found.append(np.linalg.solve(kept, y - block @ self.fit.coef))
-        return found
-
-    @property
-    def law(self) -> Float[np.ndarray, "coefs functions"]:
-        return (self.to_law @ self.fit.coef).reshape(-1, self.n_functions)
-
-    @property
-    def covariance(self) -> Float[np.ndarray, "unknowns unknowns"]:
-        """Covariance of law.ravel(), for rows of variance 1."""
-        root = self.to_law @ self.fit.root
-        return root @ root.T
+Rows = Sequence[tuple[Float[np.ndarray, "_ coefs"], Float[np.ndarray, " _"]]]  # of each point
 
 
 def pool_rows(
-    rows: Sequence[tuple[Float[np.ndarray, "_ coefs"], Float[np.ndarray, " _"]]],
-    basis: Basis,
-    size: Float[np.ndarray, " coefs"],
-) -> PooledFit:
+    rows: Rows, basis: Basis, size: Float[np.ndarray, " coefs"]
+) -> Float[np.ndarray, "coefs functions"]:
     """Fit one law to the rows (theta_p, y_p) of all points p.
 
     The law W minimises the sum over p of |theta_p W f(p) - y_p|^2 (`LeastSquares`). Assumes that
-    all rows have equal variances: divide each point's by its own.
+    all rows have equal variances: divide each point's by its own. size: of the coefficients.
     """
+    fit, _ = _fit(rows, basis, size)
+    return (basis.to_law(size) @ fit.coef).reshape(-1, basis.values.shape[1])
+
+
+def residuals_left_out(
+    rows: Rows, basis: Basis, size: Float[np.ndarray, " coefs"]
+) -> list[Float[np.ndarray, " _"]]:
+    """Residuals of every point's rows by the law that `pool_rows` fits to the other points.
+
+    They are (1 - H_p)^-1 r_p, with r_p the residuals of the point in the fit of all points and
+    H_p its block of the hat matrix.
+    Raises ValueError if a point is indispensable: without it the others do not tell the
+    functions apart.
+    """
+    found, (fit, blocks) = [], _fit(rows, basis, size)
+    for block, (_, y) in zip(blocks, rows, strict=True):
+        hat = block @ fit.root
+        kept = np.eye(len(y)) - hat @ hat.T
+        if np.linalg.eigvalsh(kept).min(initial=1.0) < 1.0 - FULL_LEVERAGE:
+            raise ValueError(
+                "a law that is tested by leaving out points must not hang on one of them: "
+                "without it the others do not tell its functions apart; add points, or take a "
+                "law of fewer functions"
+            )
+        found.append(np.linalg.solve(kept, y - block @ fit.coef))
+    return found
+
+
+def _fit(
+    rows: Rows, basis: Basis, size: Float[np.ndarray, " coefs"]
+) -> tuple[LeastSquares, list[Float[np.ndarray, "_ unknowns"]]]:
+    """Fit the unknowns of `Basis.to_law` to the rows; and the design of each point."""
     # Row r of point p holds theta_p[r, k] q_p[m] in the column of coefficient k and function m.
-    blocks = zip(rows, basis.orthonormal, strict=True)
-    design = np.concatenate([np.kron(theta * size, q[None]) for (theta, _), q in blocks])
-    fit = LeastSquares.of_rows(design, np.concatenate([y for _, y in rows]))
-    return PooledFit(fit, size, basis.to_law(size), basis.values.shape[1])
+    pairs = zip(rows, basis.orthonormal, strict=True)
+    blocks = [np.kron(theta * size, q[None]) for (theta, _), q in pairs]
+    target = np.concatenate([y for _, y in rows])
+    return LeastSquares.of_rows(np.concatenate(blocks), target), blocks
 
 
 def invert_covariance(

@@ -107,6 +107,20 @@ def whiten_rows(
     )
 
 
+def whiten_terms(
+    problem: RegressionRows,
+    terms: Int[np.ndarray, " own"],
+    coef: Float[np.ndarray, " own"],
+    *,
+    n_steps: int,
+    negligible: float = 0.0,
+) -> WhitenedRows:
+    """`whiten_rows` for terms given by their indices, and their coefficients; no other is kept."""
+    mask, full = np.zeros(len(problem.library), dtype=np.bool_), np.zeros(len(problem.library))
+    mask[terms], full[terms] = True, coef
+    return whiten_rows(problem, mask, full, n_steps=n_steps, negligible=negligible, kept=mask)
+
+
 def _is_near(before: Coef, after: Coef, fraction: float) -> bool:
     """Whether coefficients differ by less than a fraction of the latter; never for 0."""
     change = after - before

@@ -328,9 +328,7 @@ def is_even(t: Signal) -> bool:
     return bool(off <= max(ROUNDED * step, rounding_s(t)))
 
 
-def even_grid(
-    t: Signal,
-) -> tuple[Float[np.ndarray, " points"], csr_array]:
+def even_grid(t: Signal) -> tuple[Float[np.ndarray, " points"], csr_array]:
     """Even grid with about the median step, and the matrix (points, samples) that interpolates.
 
     Interpolation is linear: weights are not negative, so noise is never amplified.

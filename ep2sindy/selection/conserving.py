@@ -51,21 +51,32 @@ def search_conserving_systems(
     columns, target = _join_rows(problems, task, processes, roles.known)
     norms = column_norms(columns)
     unit = columns / norms
-    masks = search.supports(unit.T @ unit, unit.T @ target, float(target @ target))
-    whole = _rank_supports(_keep_complete(masks, processes, roles.names), unit, target)
+    xx, xy = unit.T @ unit, unit.T @ target
+    masks = search.supports(xx, xy, float(target @ target))
+    complete = _keep_complete(masks, processes, roles.names)
+    coef = fit_masks(xx, xy, complete)
+    # The smallest come first, of a size by their residual.
+    order = np.lexsort([*~complete.T[::-1], -coef @ xy, complete.sum(axis=1)])
+    independent = order[np.isfinite(coef[order]).all(axis=1)]
+    whole = [(np.flatnonzero(complete[k]), coef[k, complete[k]]) for k in independent]
     terms = [task.library.index(process.term) for process in processes]
     means = task.theta.mean(axis=0)[terms] if roles.forward else None
 
-    def build(support: Support) -> tuple[list[Process], np.ndarray, np.ndarray | None]:
+    def parts_of(support: Support) -> tuple[list[Process], np.ndarray, np.ndarray | None]:
         """Processes of a support, their coefficients, and the means of their terms."""
         chosen, values = support
         own_means = None if means is None else means[chosen]
         return [processes[k] for k in chosen], values / norms[chosen], own_means
 
-    admissible = [support for support in whole if not find_broken_demands(*build(support))]
+    admissible = [support for support in whole if not find_broken_demands(*parts_of(support))]
     kept = _keep_first(admissible or whole, depth)
-    systems = [_build_system(task, roles, *build(support)) for support in kept]
-    found = [system for system in systems if system is not None]
+    found = []
+    for chosen, values, own_means in map(parts_of, kept):
+        held = constraint_of(task.library, task.states, chosen, roles.known_processes)
+        if held is not None:  # its coefficients tell the processes apart
+            fixed = np.array([roles.known.get(held.coefficients[k], 0.0) for k in held.free])
+            free = process_matrix(held) @ values + fixed
+            found.append(TrialSystem.of(task, held, free, own_means))
     if not found:
         raise ValueError(
             f"no system of up to {masks.sum(axis=1).max(initial=0)} terms plays all of the roles "
@@ -115,38 +126,9 @@ def _keep_complete(
     return masks[np.all(played, axis=0)]
 
 
-def _rank_supports(
-    masks: Bool[np.ndarray, "supports processes"],
-    columns: Float[np.ndarray, "rows processes"],
-    target: Float[np.ndarray, " rows"],
-) -> list[Support]:
-    """The supports with their coefficients, smallest sizes first, of a size by their residual."""
-    xy = columns.T @ target
-    coef = fit_masks(columns.T @ columns, xy, masks)
-    order = np.lexsort([*~masks.T[::-1], -coef @ xy, masks.sum(axis=1)])
-    independent = order[np.isfinite(coef[order]).all(axis=1)]
-    return [(np.flatnonzero(masks[k]), coef[k, masks[k]]) for k in independent]
-
-
 def _keep_first(supports: Sequence[Support], depth: int) -> list[Support]:
     sizes = [len(chosen) for chosen, _ in supports]
     return [each for k, each in enumerate(supports) if k - sizes.index(sizes[k]) < depth]
-
-
-def _build_system(
-    task: DiscoveryProblem,
-    roles: Roles,
-    processes: Sequence[Process],
-    values: Float[np.ndarray, " processes"],
-    means: Float[np.ndarray, " processes"] | None,
-) -> TrialSystem | None:
-    """The system of these processes; None if its coefficients do not tell them apart."""
-    held = constraint_of(task.library, task.states, processes, roles.known_processes)
-    if held is None:
-        return None
-    known = roles.known
-    fixed = np.array([known.get(held.coefficients[k], 0.0) for k in held.free])
-    return TrialSystem.of(task, held, process_matrix(held) @ values + fixed, means)
 
 
 def _add_fronts(

@@ -250,14 +250,8 @@ def cut_segments(
 ) -> WindowBatch:
     """Windows of segments of the runs, no longer than the longest segment."""
     pieces = [runs[part.run].window(part.start, part.stop) for part in segments]
-    return cut_windows(
-        pieces,
-        states=model.states,
-        inputs=model.inputs,
-        n_windows=n_windows,
-        window=min(window, max(piece.n_samples for piece in pieces)),
-        rng=np.random.default_rng(seed),
-    )
+    length = min(window, max(piece.n_samples for piece in pieces))
+    return cut_windows(pieces, model, n_windows=n_windows, window=length, rng=seed)
 
 
 def plan_refinement(batch: WindowBatch, library: Library) -> tuple[MultipleShooting, int]:

@@ -14,13 +14,7 @@ from jaxtyping import Float
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import polynomial
 from ep2sindy.model.model import SparseModel, coef_matrix
-from ep2sindy.systems.systems import (
-    System,
-    damped_oscillator,
-    lorenz,
-    lotka_volterra,
-    van_der_pol,
-)
+from ep2sindy.systems.systems import System, damped_oscillator, lorenz, lotka_volterra, van_der_pol
 
 # Systems with a parameter or a start drawn at random. The thesis draws the Van der Pol oscillator's
 # mu and starts it at (1, 1), as the system does. It does not state the starts of the other systems,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -72,8 +72,10 @@ class System:
             raise ValueError(
                 f"noise must be zero, or positive together with an rng: noise={noise}, rng={rng}"
             )
-        start = self.initial if initial is None else initial
-        t, states = _integrated(_Start.of(self, np.asarray(start, dtype=np.float64)))
+        start = np.asarray(self.initial if initial is None else initial, dtype=np.float64)
+        t, states = _integrated(
+            self.name, self.model.to_json(), tuple(start.tolist()), self.duration_s, self.rate_Hz
+        )
         if rng is not None:
             generator = np.random.default_rng(rng)
             rms = np.sqrt(np.square(states).mean(axis=0))
@@ -81,40 +83,25 @@ class System:
         return Trajectory(t=t, states=states, state_names=self.model.states, label=self.name)
 
 
-@dataclass(frozen=True)
-class _Start:
-    """A system and its start, used as a cache key: equal if the integration would be the same."""
-
-    key: tuple[object, ...]
-    system: System = field(compare=False)
-    initial: Float[np.ndarray, " n_states"] = field(compare=False)
-
-    @staticmethod
-    def of(system: System, initial: Float[np.ndarray, " n_states"]) -> _Start:
-        model = system.model
-        numbers = model.coef.tobytes(), initial.tobytes(), system.duration_s, system.rate_Hz
-        key = (*model.states, *model.library.variables, *model.library.names, *numbers)
-        return _Start(key, system, initial)
-
-
 @lru_cache(maxsize=64)  # realizations often differ only in the noise added to one trajectory
 def _integrated(
-    start: _Start,
+    name: str, model: str, initial: tuple[float, ...], duration_s: float, rate_Hz: float
 ) -> tuple[Float[np.ndarray, " samples"], Float[np.ndarray, "samples n_states"]]:
-    system = start.system
-    t = np.arange(round(system.duration_s * system.rate_Hz)) / system.rate_Hz
+    """Times and states of a model that is given as JSON, so that it can be a key of the cache."""
+    equations = SparseModel.from_json(model)
+    t = np.arange(round(duration_s * rate_Hz)) / rate_Hz
     if len(t) < 2:
         raise ValueError(f"a trajectory needs two samples: {len(t)} fit in")
     found = solve_stages(
-        lambda _, x: system.model.derivative(x, np.empty(0)),
+        lambda _, x: equations.derivative(x, np.empty(0)),
         t,
-        start.initial,
+        np.array(initial),
         rtol=1e-10,
         limit_s=60.0,
     )
     if found.ended_early:
         raise ValueError(
-            f"{system.name} must run for duration_s={system.duration_s:g}: {found.message}; "
+            f"{name} must run for duration_s={duration_s:g}: {found.message}; "
             "choose milder parameters or a shorter duration"
         )
     states = found.y

@@ -85,7 +85,11 @@ def _averaged(field: xr.Dataset, zone: Zone) -> Terms:
             f"{float(field['z'][0]):g} to {float(field['z'][-1]):g} m"
         )
     dz = field["dz"].values[first:beyond].astype(float)
-    _check_in_channel(field, beyond)
+    if "area" in field and bool((field["area"][:, : beyond + 1] != 1.0).any()):
+        raise ValueError(
+            "a zone's balance holds where the cross-section is that of the channel: this zone "
+            f"reaches to {float(field['z'][beyond - 1]):g} m, into the plume; end it at the exit"
+        )
 
     def summed(name: str) -> np.ndarray:
         """Sum over the charge states of the run."""
@@ -159,12 +163,3 @@ def _estimated(field: xr.Dataset, zone: Zone, *, axisymmetric: bool) -> Terms:
         changes = terms["change_i"] + terms["change_n"]
         terms["exit_n"] = terms["supply"] - terms["exit_i"] - changes
     return terms
-
-
-def _check_in_channel(field: xr.Dataset, beyond: int) -> None:
-    """Raise ValueError if the plasma's cross-section changes within a zone's cells."""
-    if "area" in field and bool((field["area"][:, : beyond + 1] != 1.0).any()):
-        raise ValueError(
-            "a zone's balance holds where the cross-section is that of the channel: this zone "
-            f"reaches to {float(field['z'][beyond - 1]):g} m, into the plume; end it at the exit"
-        )

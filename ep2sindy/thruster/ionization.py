@@ -81,9 +81,7 @@ def _interpolate_table(
     return lambda T: np.interp(T, T_eV, rates)
 
 
-def read_rate_table(
-    path: Path,
-) -> tuple[Float[np.ndarray, " rows"], Float[np.ndarray, " rows"]]:
+def read_rate_table(path: Path) -> tuple[Float[np.ndarray, " rows"], Float[np.ndarray, " rows"]]:
     """First two columns of a CSV file: T_e in eV, increasing, and rate in m^3/s."""
     cells = [row[:2] for row in read_cells(path, "rate table", may_be_short=True)]
     rows = [row for row in cells if any(number(cell) is not None for cell in row)]

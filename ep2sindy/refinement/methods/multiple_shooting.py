@@ -7,11 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from ep2sindy.refinement.kernels import (
-    condense,
-    propagate,
-    starts,
-)
+from ep2sindy.refinement.kernels import condense, propagate, starts
 from ep2sindy.refinement.problem import (
     Iteration,
     RefinementFit,
@@ -19,7 +15,7 @@ from ep2sindy.refinement.problem import (
     ignore,
     residual_weights,
 )
-from ep2sindy.refinement.steps import ONE_RUNGE_KUTTA, Step
+from ep2sindy.refinement.steps import ONE_RUNGE_KUTTA, Step, halved
 
 # Directions of the scalings weaker than this fraction of the strongest are dropped.
 RANK = 1e-12
@@ -123,10 +119,10 @@ class MultipleShooting:
         self, problem: RefinementProblem, fit: RefinementFit, points: np.ndarray
     ) -> RefinementFit | None:
         """Continue some points of a fit from their present state, with half the time step."""
-        step = fit.step.halved()
-        return (
-            None if step is None else self._finish(_Path(problem, replace(fit, step=step)), points)
-        )
+        step = halved(fit.step)
+        if step is None:
+            return None
+        return self._finish(_Path(problem, replace(fit, step=step)), points)
 
     def memories(self, window: int) -> list[int]:
         """Memories, in samples, of the stages before those without a pull."""

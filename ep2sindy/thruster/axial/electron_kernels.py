@@ -3,27 +3,9 @@
 import numpy as np
 
 from ep2sindy.runtime.compilation import compiled
+from ep2sindy.thruster.axial import state_kernels as recorded
 from ep2sindy.thruster.axial.collision_kernels import collisions
-from ep2sindy.thruster.axial.state_kernels import (
-    CURRENT,
-    ENTRY,
-    FAST,
-    LOOP,
-    ONE,
-    P_ANODE,
-    P_CATHODE,
-    P_INELASTIC,
-    P_IONS,
-    P_WALL,
-    POWER,
-    SUPPLY,
-    SUPPLY_CURRENT,
-    THRUST,
-    VOLTAGE,
-    WALL_CURRENT,
-    faces,
-    inside,
-)
+from ep2sindy.thruster.axial.state_kernels import ENTRY, FAST, LOOP, ONE, faces, inside
 from ep2sindy.thruster.constants import E_CHARGE, M_ELECTRON
 
 HUGE = 1e200  # of determinants, far from overflow
@@ -81,7 +63,7 @@ def start_density(state):
 def sheath_drop(state, model):
     """Potential of the plasma above the anode in V, by the last current: see AnodeSheath."""
     T, n = max(state.T_e_eV[1], COLDEST_EV), state.n_e[1]
-    electrons = state.instant[CURRENT] / (E_CHARGE * model.area) - state.flux_q[1]
+    electrons = state.instant[recorded.CURRENT] / (E_CHARGE * model.area) - state.flux_q[1]
     thermal = 0.25 * n * np.sqrt(8.0 * E_CHARGE * T / (np.pi * M_ELECTRON))
     if not model.sheath or electrons <= 0.0 or electrons >= thermal:
         return 0.0
@@ -104,16 +86,17 @@ def thevenin(state, model, dt):
 
     With dt = 0 the circuit is at rest: no voltage over the coil, no current into the capacitor.
     """
-    source, resistance = state.instant[SUPPLY], model.resistance
+    source, resistance = state.instant[recorded.SUPPLY], model.resistance
     if dt == 0.0:
         return source, resistance
     inertia = model.inductance / dt
-    source, resistance = source + inertia * state.instant[SUPPLY_CURRENT], resistance + inertia
+    source = source + inertia * state.instant[recorded.SUPPLY_CURRENT]
+    resistance = resistance + inertia
     if model.capacitance == 0.0:
         return source, resistance
     held = model.capacitance / dt
     parallel = 1.0 / (1.0 / resistance + held)
-    return (source / resistance + held * state.instant[VOLTAGE]) * parallel, parallel
+    return (source / resistance + held * state.instant[recorded.VOLTAGE]) * parallel, parallel
 
 
 @compiled(**FAST)
@@ -121,12 +104,12 @@ def follow_circuit(state, model, dt, behind):
     """Record the voltage behind the circuit, and the current that the supply gives."""
     instant = state.instant
     if dt == 0.0 or model.capacitance == 0.0:
-        instant[SUPPLY_CURRENT] = instant[CURRENT]
+        instant[recorded.SUPPLY_CURRENT] = instant[recorded.CURRENT]
     else:
         inertia = model.inductance / dt
-        driven = instant[SUPPLY] + inertia * instant[SUPPLY_CURRENT] - behind
-        instant[SUPPLY_CURRENT] = driven / (model.resistance + inertia)
-    instant[VOLTAGE] = behind
+        driven = instant[recorded.SUPPLY] + inertia * instant[recorded.SUPPLY_CURRENT] - behind
+        instant[recorded.SUPPLY_CURRENT] = driven / (model.resistance + inertia)
+    instant[recorded.VOLTAGE] = behind
 
 
 @compiled(**LOOP)
@@ -178,7 +161,7 @@ def ohm(state, model, dt, drop, w):
     drive, load = drive_and_load(
         state.n_e, per_n, g, state.T_e_eV, w.per_mobility, w.gradient, model
     )
-    state.instant[SUPPLY] = supply_voltage(state, model)
+    state.instant[recorded.SUPPLY] = supply_voltage(state, model)
     source, resistance = thevenin(state, model, dt)
     current = (source + drop + drive) / (load / plasma + resistance)
     total = current / plasma
@@ -187,9 +170,9 @@ def ohm(state, model, dt, drop, w):
         total, per_n, g, w.per_nu, w.per_mobility, w.gradient, counted, state.E, w.heating,
         state.drift_eV, model,
     )  # fmt: skip
-    state.instant[CURRENT] = current
-    state.instant[POWER] = current * along
-    state.instant[P_IONS] = plasma * work
+    state.instant[recorded.CURRENT] = current
+    state.instant[recorded.POWER] = current * along
+    state.instant[recorded.P_IONS] = plasma * work
     follow_circuit(state, model, dt, source - resistance * current)
     return total
 
@@ -338,12 +321,12 @@ def record_powers(state, model, lost, to_wall, w):
         on_wall += z**1.5 * drained(n, state.wall_loss, dz, spread)
         thrust += flux[-2] * flux[-2] / n[-2]
     watts, end = E_CHARGE * model.area, model.spread_at[-1]
-    instant[THRUST] = model.ion_mass * model.area * end * thrust
-    instant[WALL_CURRENT] = watts * on_wall
-    instant[P_INELASTIC] = watts * lost
-    instant[P_WALL] = watts * to_wall
-    instant[P_ANODE] = -watts * (w.down[0] * T[0] + w.up[0] * T[1])
-    instant[P_CATHODE] = watts * end * (w.down[-2] * T[-2] + w.up[-2] * T[-1])
+    instant[recorded.THRUST] = model.ion_mass * model.area * end * thrust
+    instant[recorded.WALL_CURRENT] = watts * on_wall
+    instant[recorded.P_INELASTIC] = watts * lost
+    instant[recorded.P_WALL] = watts * to_wall
+    instant[recorded.P_ANODE] = -watts * (w.down[0] * T[0] + w.up[0] * T[1])
+    instant[recorded.P_CATHODE] = watts * end * (w.down[-2] * T[-2] + w.up[-2] * T[-1])
 
 
 @compiled(**FAST)
@@ -357,7 +340,7 @@ def follow_electrons(state, model, dt, w):
     # The ends of the domain, half a cell outside the last centres, are held at their temperature.
     T[0] = max(2.0 * model.anode_T_e_eV - T[1], COLDEST_EV)
     if model.sheath:  # electrons from the anode have its temperature; otherwise T[1] is taken
-        T[0] = T[1] if state.instant[CURRENT] > 0.0 else model.anode_T_e_eV
+        T[0] = T[1] if state.instant[recorded.CURRENT] > 0.0 else model.anode_T_e_eV
     T[-1] = max(2.0 * model.cathode_T_e_eV - T[-2], COLDEST_EV)
     if not collisions(state, model, w):
         return False

@@ -5,22 +5,9 @@ import math
 import numpy as np
 
 from ep2sindy.runtime.compilation import compiled
+from ep2sindy.thruster.axial import state_kernels as recorded
 from ep2sindy.thruster.axial.electron_kernels import COLDEST_EV, sheath_drop
-from ep2sindy.thruster.axial.state_kernels import (
-    BEAM,
-    ENTRY,
-    FACE_I,
-    FACE_N,
-    FAST,
-    IONIZATION,
-    IONS_OUT,
-    LOOP,
-    NEUTRALS_OUT,
-    ONE,
-    PER_CHARGE,
-    WALL_LOSS,
-    inside,
-)
+from ep2sindy.thruster.axial.state_kernels import ENTRY, FAST, LOOP, ONE, inside
 from ep2sindy.thruster.constants import E_CHARGE
 
 TINY = 1e-60  # avoids 0/0
@@ -143,16 +130,8 @@ def births(n, g, nn, state, model, w):
         if below < 0:
             birth(rates[t + 1], n_e, nn, speed, w.consumed, gain, momentum_gain, False)
         else:
-            further_birth(
-                rates[t + 1],
-                n_e,
-                n[below],
-                g[below],
-                w.gain[below],
-                w.momentum_gain[below],
-                gain,
-                momentum_gain,
-            )
+            loss, drag = w.gain[below], w.momentum_gain[below]
+            further_birth(rates[t + 1], n_e, n[below], g[below], loss, drag, gain, momentum_gain)
 
 
 @compiled(**FAST)
@@ -244,12 +223,13 @@ def stage_of_ions(k, new, new_g, n, g, nn, keep, dt, state, model, sums, w):
     follow_ions(
         new, new_g, u, n, g, flux, w.momentum_flux, w.gain[k], w.momentum_gain[k], state.E,
         state.wall_loss,
-        model.per_before, model.per_behind, w.neutralised, cells[WALL_LOSS],
-        cells[FACE_I + PER_CHARGE * k], keep, dt, weight, charge, np.sqrt(z), c2, k == 0,
+        model.per_before, model.per_behind, w.neutralised, cells[recorded.WALL_LOSS],
+        cells[recorded.FACE_I + recorded.PER_CHARGE * k], keep, dt, weight, charge, np.sqrt(z), c2,
+        k == 0,
     )  # fmt: skip
     leaving = flux[-2] * model.spread_at[-1]
-    sums.series[BEAM] += weight * z * leaving
-    sums.series[IONS_OUT] += weight * leaving
+    sums.series[recorded.BEAM] += weight * z * leaving
+    sums.series[recorded.IONS_OUT] += weight * leaving
     return flux[0]
 
 
@@ -269,9 +249,9 @@ def stage(new, new_g, new_nn, n, g, nn, keep, dt, state, model, sums, w):
     flux[0] = model.neutral_inflow - at_anode
     follow_neutrals(
         new_nn, nn, flux, w.consumed, w.neutralised, model.neutral_before, model.neutral_behind,
-        sums.cells[IONIZATION], sums.cells[FACE_N], keep, dt, weight,
+        sums.cells[recorded.IONIZATION], sums.cells[recorded.FACE_N], keep, dt, weight,
     )  # fmt: skip
-    sums.series[NEUTRALS_OUT] += weight * flux[-2] * model.spread_at[-1]
+    sums.series[recorded.NEUTRALS_OUT] += weight * flux[-2] * model.spread_at[-1]
 
 
 @compiled(**FAST)

@@ -3,28 +3,10 @@
 import numpy as np
 
 from ep2sindy.runtime.compilation import compiled
+from ep2sindy.thruster.axial import state_kernels as recorded
 from ep2sindy.thruster.axial.electron_kernels import follow_electrons, start_density
 from ep2sindy.thruster.axial.heavy_kernels import add_scaled, follow_heavy, start_speeds
-from ep2sindy.thruster.axial.state_kernels import (
-    CHANGE_I,
-    CHANGE_N,
-    E_Z,
-    ENERGY,
-    ENTRY,
-    FAST,
-    FLUX_I,
-    LOOP,
-    N_I,
-    N_N,
-    NO_NAN,
-    PER_CHARGE,
-    R_ION,
-    SHORTEST_STEP,
-    SPREAD,
-    T_E,
-    U_IZ,
-    inside,
-)
+from ep2sindy.thruster.axial.state_kernels import ENTRY, FAST, LOOP, NO_NAN, SHORTEST_STEP, inside
 
 
 @compiled(**NO_NAN)
@@ -69,11 +51,13 @@ def add_instant(sums, state, weight, w):
     """Add weight times the present fields to the sums, except those that the heavy step adds."""
     cells = sums.cells
     add_fields(
-        cells[N_N], cells[T_E], cells[R_ION], cells[E_Z], cells[ENERGY], state.n_n, state.T_e_eV,
-        state.rates[0], state.E, state.energy, weight,
+        cells[recorded.N_N], cells[recorded.T_E], cells[recorded.R_ION], cells[recorded.E_Z],
+        cells[recorded.ENERGY], state.n_n, state.T_e_eV, state.rates[0], state.E, state.energy,
+        weight,
     )  # fmt: skip
     for k in range(state.n_i.shape[0]):
-        n, u, g = N_I + PER_CHARGE * k, U_IZ + PER_CHARGE * k, FLUX_I + PER_CHARGE * k
+        at = recorded.PER_CHARGE * k
+        n, u, g = recorded.N_I + at, recorded.U_IZ + at, recorded.FLUX_I + at
         add_ions(cells[n], cells[u], cells[g], state.n_i[k], w.u[k], state.flux_i[k], weight)
     add_scaled(sums.series, state.instant, weight)
 
@@ -81,9 +65,9 @@ def add_instant(sums, state, weight, w):
 @compiled(**FAST)
 def add_changes(sums, state, sign):
     """Add the densities' gain over a sample; call with sign -1 before it and +1 after it."""
-    add_scaled(sums.cells[CHANGE_N], state.n_n, sign)
+    add_scaled(sums.cells[recorded.CHANGE_N], state.n_n, sign)
     for k in range(state.n_i.shape[0]):
-        add_scaled(sums.cells[CHANGE_I + PER_CHARGE * k], state.n_i[k], sign)
+        add_scaled(sums.cells[recorded.CHANGE_I + recorded.PER_CHARGE * k], state.n_i[k], sign)
 
 
 @compiled(**ENTRY)
@@ -115,7 +99,7 @@ def advance(state, model, sums, w, sample_s, averaged, fields, series):
             add_instant(sums, state, dt, w)
             left -= dt
         add_changes(sums, state, 1.0)
-        add_scaled(sums.cells[SPREAD], model.spread, weight)
+        add_scaled(sums.cells[recorded.SPREAD], model.spread, weight)
         for i in range(size):
             reached = state.T_e_eV[i] + model.drift_weight * state.drift_eV[i] * 2.0 / 3.0
             state.hottest_eV[0] = max(state.hottest_eV[0], reached)

@@ -14,6 +14,7 @@ from jaxtyping import Float
 
 from ep2sindy.runtime.progress import Advance, Progress, as_progress
 from ep2sindy.thruster.axial import kernels
+from ep2sindy.thruster.axial import state_kernels as recorded
 from ep2sindy.thruster.axial.electron_kernels import electron_step, start_density
 from ep2sindy.thruster.axial.model import (
     CFL,
@@ -23,12 +24,7 @@ from ep2sindy.thruster.axial.model import (
     followers_of,
     lengths_and_centres,
 )
-from ep2sindy.thruster.axial.output import (
-    POWERS,
-    field_columns,
-    labelled,
-    series_of,
-)
+from ep2sindy.thruster.axial.output import POWERS, field_columns, labelled, series_of
 from ep2sindy.thruster.axial.settings import Settings, to_json
 from ep2sindy.thruster.axial.starts import (
     Beginning,
@@ -38,18 +34,7 @@ from ep2sindy.thruster.axial.starts import (
     end_of,
     stored_energy,
 )
-from ep2sindy.thruster.axial.state_kernels import (
-    CELL_SUMS,
-    CURRENT,
-    PER_CHARGE,
-    SERIES_SUMS,
-    SUPPLY_CURRENT,
-    VOLTAGE,
-    AxialModel,
-    AxialState,
-    new_sums,
-    new_work,
-)
+from ep2sindy.thruster.axial.state_kernels import AxialModel, AxialState, new_sums, new_work
 from ep2sindy.thruster.balance import INFLOW
 from ep2sindy.thruster.cache import read_or_run
 from ep2sindy.thruster.parameters import OperatingPoint, Thruster
@@ -268,14 +253,15 @@ def _march(
 
     These are the fields and series of n_rows samples.
     """
-    n_fields, n_cells = len(CELL_SUMS) + PER_CHARGE * (len(state.n_i) - 1), state.n_n.size
+    n_fields = len(recorded.CELL_SUMS) + recorded.PER_CHARGE * (len(state.n_i) - 1)
+    n_cells = state.n_n.size
     fields = np.empty((n_fields, n_rows, n_cells - 2), np.float32)
-    series = np.empty((n_rows, len(SERIES_SUMS)))
+    series = np.empty((n_rows, len(recorded.SERIES_SUMS)))
     sums, work = new_sums(n_fields, n_cells), new_work(*state.n_i.shape)
 
     def march(rows: slice) -> int:
-        recorded = settings.sample_s, settings.averaged, fields[:, rows], series[rows]
-        return kernels.advance(state, model, sums, work, *recorded)
+        filled = settings.sample_s, settings.averaged, fields[:, rows], series[rows]
+        return kernels.advance(state, model, sums, work, *filled)
 
     def march_by_samples(rows: slice) -> int:
         for row in range(rows.start, rows.stop):
@@ -306,9 +292,9 @@ def _attributes(
             attributes["mass_balance"] = mass_balance(field, model, seconds)
     hottest = float(record.state.hottest_eV[0])
     attributes["rates"] = describe_uncovered(thruster.propellant, hottest) or "covered"
-    names = {"end_I_d": CURRENT, "end_V": VOLTAGE, "end_I_supply": SUPPLY_CURRENT}
-    attributes |= {name: float(record.state.instant[k]) for name, k in names.items()}
-    return attributes
+    end = record.state.instant
+    attributes["end_I_d"], attributes["end_V"] = end[[recorded.CURRENT, recorded.VOLTAGE]].tolist()
+    return attributes | {"end_I_supply": float(end[recorded.SUPPLY_CURRENT])}
 
 
 def mass_balance(field: xr.Dataset, model: AxialModel, seconds: float) -> float:

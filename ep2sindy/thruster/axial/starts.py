@@ -7,7 +7,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import ClassVar, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import xarray as xr
@@ -16,14 +16,8 @@ from jaxtyping import Float
 from ep2sindy.data.readers.registry import reader_of
 from ep2sindy.data.readers.source import damage_named
 from ep2sindy.runtime.files import read_json
-from ep2sindy.thruster.axial.state_kernels import (
-    CURRENT,
-    SERIES_SUMS,
-    SUPPLY_CURRENT,
-    VOLTAGE,
-    AxialModel,
-    AxialState,
-)
+from ep2sindy.thruster.axial import state_kernels as recorded
+from ep2sindy.thruster.axial.state_kernels import AxialModel, AxialState
 from ep2sindy.thruster.checks import check_positive
 from ep2sindy.thruster.constants import E_CHARGE
 
@@ -80,9 +74,7 @@ class Start(Protocol):
 class GuessedStart:
     """A discharge-like plasma: T_e peaks at the exit, where the neutrals are depleted."""
 
-    @property
-    def label(self) -> str:
-        return "guessed profiles"
+    label: ClassVar[str] = "guessed profiles"
 
     def begin(self, model: AxialModel, z: Profile, parameters: str) -> Beginning:
         channel_length = json.loads(parameters)["thruster"]["channel_length"]
@@ -211,10 +203,10 @@ class Restart:
         state.drift_eV[1:-1] = cells("drift_eV")[1:-1]
         if END + "tangent" in self._end:
             state.tangent[:] = cells("tangent")
-        current = state.instant[CURRENT] = float(self._end.attrs["end_I_d"])
-        state.instant[SUPPLY_CURRENT] = self._end.attrs.get("end_I_supply", current)
+        current = state.instant[recorded.CURRENT] = float(self._end.attrs["end_I_d"])
+        state.instant[recorded.SUPPLY_CURRENT] = self._end.attrs.get("end_I_supply", current)
         at_rest = model.supply[0] - model.resistance * current
-        state.instant[VOLTAGE] = self._end.attrs.get("end_V", at_rest)
+        state.instant[recorded.VOLTAGE] = self._end.attrs.get("end_V", at_rest)
         if not same:
             return Beginning(state, note=f"interpolated from {points.size} to {z.size - 2} cells")
         state.energy[:], state.E[:] = cells("energy_e"), cells("E_z")
@@ -268,7 +260,7 @@ def _state(
         n_i=n, flux_i=g, n_n=n_n.copy(), T_e_eV=T_e_eV.copy(), energy=1.5 * n_e * T_e_eV,
         drift_eV=zeros[0], n_e=n_e, flux_q=zeros[1], log_n=np.ones((2, size)), E=zeros[2],
         rates=np.zeros((charges * (charges + 1) // 2, size)), wall_loss=np.zeros(size),
-        tangent=np.zeros(size), instant=np.zeros(len(SERIES_SUMS)),
+        tangent=np.zeros(size), instant=np.zeros(len(recorded.SERIES_SUMS)),
         clock=np.zeros(1), hottest_eV=np.zeros(1),
     )  # fmt: skip
 
