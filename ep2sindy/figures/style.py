@@ -211,10 +211,7 @@ def unit_text(unit: str) -> str:
 
 
 def frame_limits(
-    data: Float[np.ndarray, " samples"],
-    models: Float[np.ndarray, " values"],
-    *,
-    rare: float = 0.0,
+    data: Float[np.ndarray, " samples"], models: Float[np.ndarray, " values"], *, rare: float = 0.0
 ) -> Limits:
     """Limits around data and models, within twice the data's range.
 

@@ -15,13 +15,7 @@ from ep2sindy.report.document import Result, Text
 from ep2sindy.report.models import equations
 from ep2sindy.report.report import Report
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View, percent
-from ep2sindy.studies.fitted import (
-    FITTED,
-    Fitted,
-    ends,
-    n_sustained,
-    worst_amplitude,
-)
+from ep2sindy.studies.fitted import FITTED, Fitted, ends, n_sustained, worst_amplitude
 from ep2sindy.studies.views import largest
 
 NOTE = (
