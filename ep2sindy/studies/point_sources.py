@@ -180,7 +180,7 @@ def open_points(
     sources: Sequence[PointSource], inputs: Sequence[str], *, workers: Workers, report: Report
 ) -> list[OpenedPoint]:
     """Open or simulate all points, and report their data and warnings."""
-    stage = report.progress(len(sources), "point opened")
+    stage = report.watch.stage(len(sources), "point opened")
     points = collect(workers, partial(PointSource.open, inputs=inputs), sources, stage)
     used = {point.label: point.used for point in points if point.used}
     if len(alike := {*used.values()}) == 1:  # all points are averaged alike

@@ -100,7 +100,7 @@ class Source:
 
     def opened(self, libraries: Iterable[Library], report: Report) -> tuple[xr.Dataset, Trajectory]:
         """The single record, and its trajectory as `sampled` makes it."""
-        with report.progress(None, "", "data"):
+        with report.watch.stage(None, "", "data"):
             field = self.field()
         return field, self.sampled(field, libraries, report)
 
