@@ -241,11 +241,10 @@ def _less(held_to: Constraint, free: int) -> Constraint:
     """The constraint without one free coefficient, and without those that follow from it alone."""
     C = np.delete(held_to.C, free, axis=1)
     kept = np.flatnonzero(C.any(axis=1) | (held_to.d != 0.0))
-    places = {int(k): new for new, k in enumerate(kept)}
     return Constraint(
         held_to.states,
         tuple(held_to.coefficients[k] for k in kept),
         C[kept],
         held_to.d[kept],
-        np.array([places[int(k)] for k in np.delete(held_to.free, free)], dtype=np.int64),
+        np.searchsorted(kept, np.delete(held_to.free, free)),
     )
