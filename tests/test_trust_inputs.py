@@ -208,7 +208,7 @@ WAITS = """
 import threading
 from ep2sindy.app import main
 
-def command(arguments, conf):
+def command(arguments):
     threading.Thread(target=threading.Event().wait).start()  # as for a file that never comes
     raise KeyboardInterrupt
 

@@ -19,7 +19,8 @@ from ep2sindy.runtime.screen import listed, near_words
 from ep2sindy.trust.user_code import nodes_of
 
 JOBS = "jobs"  # folder of a sweep with a record of each job
-COMMANDS = ("compare", "inspect", "precompile")  # that stand first, without +exp=NAME
+# Commands, which stand first, without +exp=NAME; and the modules of this package that run them.
+COMMANDS = {"compare": "compare", "inspect": "inspection", "precompile": "precompile"}
 # Options of Hydra with a value, and those without one. A run always begins with the package's own
 # config.yaml, so the options that would replace it are not among them.
 VALUED = ("--cfg", "-c", "--package", "-p", "--config-dir")

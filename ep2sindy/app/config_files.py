@@ -1,4 +1,4 @@
-"""Config files: they are files, and what they say is counted before it is expanded."""
+"""Config files: where they are, and that what they say is counted before it is expanded."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from hydra._internal.core_plugins import file_config_source
 from hydra.plugins.config_source import ConfigResult
 
 from ep2sindy.runtime.files import read_bytes
+from ep2sindy.trust.user_code import PACKAGE
 
 MAX_NODES, MAX_DEPTH = 100_000, 50  # of a config; the largest of ours has 200, 6 deep
 
@@ -19,6 +20,18 @@ class FileConfigSource(file_config_source.FileConfigSource):
     def load_config(self, config_path: str) -> ConfigResult:
         check_config(Path(self.path, self._normalize_file_name(config_path)))
         return super().load_config(config_path)
+
+
+def conf_folder() -> Path:
+    """Folder of the package's configs: next to it in a checkout, inside it when installed."""
+    places = (PACKAGE.parent / "conf", PACKAGE / "conf")
+    for place in places:
+        if (place / "config.yaml").is_file():
+            return place
+    raise ValueError(
+        f"the package's configs must lie in one of {list(map(str, places))}: none of them has a "
+        "config.yaml; install the package again"
+    )
 
 
 def check_config(path: Path) -> None:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from omegaconf import OmegaConf
 
+from ep2sindy.app.config_files import conf_folder
 from ep2sindy.data.inspection import STEP, Inspection, compare_files, unlike
 from ep2sindy.data.mapping import Variable, read_array
 from ep2sindy.data.open import inspect_file
@@ -48,8 +49,8 @@ NOT_STATES = ("R_ion", "V_d")  # what drives a model
 MAX_LOOKED_AT, MIN_LOOKED_AT, MAX_SAMPLES = 20, 50, 50_000
 
 
-def main(arguments: Sequence[str], conf: Path) -> None:
-    """Inspect files and write a config for them. conf: the folder of the package's configs.
+def main(arguments: Sequence[str]) -> None:
+    """Inspect files and write a config for them.
 
     Raises ValueError as `ep2sindy.inspect_file` does, and for a config that exists already.
     """
@@ -90,7 +91,7 @@ def main(arguments: Sequence[str], conf: Path) -> None:
         lines = commands(found, "recognised", pattern, path=path, more=more, drives=drives)
         end = f"--write writes this to conf/data/{name}.yaml, for data={name}"
     else:
-        file = own_config(name, conf)
+        file = own_config(name)
         write_text(file, config_text(found, paths))
         lines, end = commands(found, name, pattern, drives=drives), f"written: {file}"
     header = ["next, for example:"] if lines else []
@@ -246,9 +247,9 @@ def experiments(found: Inspection) -> list[str]:
     ]
 
 
-def own_config(name: str, conf: Path) -> Path:
+def own_config(name: str) -> Path:
     """Path for a new config of the data group that is found from here; no file is overwritten."""
-    path = Path("conf") / "data" / f"{name}.yaml"
+    conf, path = conf_folder(), Path("conf") / "data" / f"{name}.yaml"
     if (conf / "data" / path.name).is_file() and conf.resolve() != Path("conf").resolve():
         raise ValueError(f"the package has data={name} itself: choose another, --write NAME")
     if path.exists():

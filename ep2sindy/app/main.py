@@ -13,6 +13,7 @@ import gc
 import os
 import sys
 from collections.abc import Sequence
+from importlib import import_module
 from pathlib import Path
 from shlex import quote
 from typing import Any
@@ -29,12 +30,11 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from ep2sindy.app.arguments import COMMANDS, JOBS, explain, options_first
-from ep2sindy.app.config_files import FileConfigSource
+from ep2sindy.app.config_files import FileConfigSource, conf_folder
 from ep2sindy.runtime.files import read_json, write_json
 from ep2sindy.runtime.screen import listed, near_words, plain, say
 from ep2sindy.runtime.threads import start_on_one_thread
 from ep2sindy.trust.interruption import end_as_interrupted
-from ep2sindy.trust.user_code import PACKAGE
 
 
 def main() -> None:
@@ -48,8 +48,7 @@ def main() -> None:
     # module of Python, such as signal.py, must not take its place in workers.
     os.environ |= {"HYDRA_FULL_ERROR": "1", "PYTHONSAFEPATH": "1"}
     try:
-        conf = conf_folder()
-        errors = [] if command(sys.argv[1:], conf) else run(conf)
+        errors = [] if command(sys.argv[1:]) else run(conf_folder())
     except (HydraException, OmegaConfBaseException, ValueError, YAMLError) as error:
         errors = [str(error) or type(error).__name__]
     except OSError as error:
@@ -65,34 +64,12 @@ def main() -> None:
         sys.exit(plain(f"error: {why}"))
 
 
-def command(arguments: Sequence[str], conf: Path) -> bool:
+def command(arguments: Sequence[str]) -> bool:
     """Carry out the command that the first argument names; returns whether it names one."""
-    name, rest = "".join(arguments[:1]), arguments[1:]
-    if name == "compare":
-        from ep2sindy.app.compare import main as compare_runs
-
-        compare_runs(rest)
-    elif name == "inspect":
-        from ep2sindy.app.inspection import main as inspect_files
-
-        inspect_files(rest, conf)
-    elif name == "precompile":
-        from ep2sindy.app.precompile import main as compile_kernels
-
-        compile_kernels(rest)
+    name = "".join(arguments[:1])
+    if name in COMMANDS:
+        import_module(f"ep2sindy.app.{COMMANDS[name]}").main(arguments[1:])  # takes seconds
     return name in COMMANDS
-
-
-def conf_folder() -> Path:
-    """Folder of the package's configs: next to it in a checkout, inside it when installed."""
-    places = (PACKAGE.parent / "conf", PACKAGE / "conf")
-    for place in places:
-        if (place / "config.yaml").is_file():
-            return place
-    raise ValueError(
-        f"the package's configs must lie in one of {list(map(str, places))}: none of them has a "
-        "config.yaml; install the package again"
-    )
 
 
 def run(conf: Path) -> list[str]:

@@ -19,7 +19,7 @@ import ep2sindy as ep
 from ep2sindy.model.many import WindowSteps, run_many
 from ep2sindy.model.vector_field import VectorField
 from ep2sindy.runtime.compilation import ANNOUNCEMENT, UNKEPT, digest, not_kept, sources
-from ep2sindy.runtime.parallel import Loky
+from ep2sindy.runtime.parallel import Loky, collect
 from ep2sindy.runtime.progress import Bars
 from ep2sindy.runtime.screen import say, say_once
 from ep2sindy.runtime.user_cache import cache_folder
@@ -69,9 +69,7 @@ def _stamp() -> Path:
 
 def _compile_all() -> None:
     """Run all parts, side by side where there are cores for them."""
-    with Bars().stage(len(PARTS), "part") as advance:
-        for _ in Loky().run(_compile, [*PARTS]):
-            advance(1)
+    collect(Loky(), _compile, [*PARTS], Bars().stage(len(PARTS), "part"))
 
 
 def _compile(part: str) -> None:

@@ -23,11 +23,7 @@ TOP = 3.0  # larger errors are marked at the edge: such a model is worse than no
 TERMS_A_LINE = 4  # terms per line of a title
 
 
-def front_figure(
-    fronts: Mapping[str, ParetoFront],
-    *,
-    label: str,
-) -> Figure:
+def front_figure(fronts: Mapping[str, ParetoFront], *, label: str) -> Figure:
     """Error against number of terms for every equation, log scale, the selected candidate marked.
 
     After a search of trajectories, which has no rows and so no error on them, the scores are drawn
@@ -68,7 +64,7 @@ def _draw_front(ax: Axes, front: ParetoFront, chosen: int | None) -> None:
     """Draw all supports, runners-up, the best of every size (line) and the selected (star)."""
     lowest = front.errors.min()
     if front.ensemble is not None:
-        _draw_ensemble(ax, front.ensemble, label=_LAYERS[0])
+        _draw_ensemble(ax, front.ensemble)
         lowest = min(lowest, front.ensemble.errors.min(initial=np.inf))
     _draw_candidates(ax, front, np.clip(front.errors, FLOOR, TOP), chosen)
     rows = "held-out" if front.held_out else "training"
@@ -118,13 +114,13 @@ def _draw_candidates(ax: Axes, front: ParetoFront, heights: np.ndarray, chosen: 
     ax.grid(axis="y", alpha=0.25)
 
 
-def _draw_ensemble(ax: Axes, ensemble: Ensemble, *, label: str) -> None:
+def _draw_ensemble(ax: Axes, ensemble: Ensemble) -> None:
     """Draw light dots; models far worse than none are carets at the upper edge."""
     above = ensemble.errors > TOP
     look: dict[str, Any] = {"color": GREY, "ls": "none", "zorder": 2, "alpha": 0.85, "mew": 0.0}
     ax.plot(
         ensemble.sizes[~above], np.maximum(ensemble.errors[~above], FLOOR), marker="o", ms=3.5,
-        label=label, **look,
+        label=_LAYERS[0], **look,
     )  # fmt: skip
     if above.any():
         sizes = np.unique(ensemble.sizes[above])

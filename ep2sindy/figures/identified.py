@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
 from ep2sindy.figures import style
@@ -27,6 +28,10 @@ SYSTEM_LABELS = {
 PANELS = {"on_front": "true equations on the front", "selected": "true equations selected"}
 
 MIN_WIDTH = 2.3  # of a heat map, in inches: its title stands above it
+
+# One hue from light to dark: legible with any colour vision, and in grey. A text on a shade beyond
+# DARK is white.
+CELLS, DARK = "Blues", 0.65
 
 # They differ by shape and filling, not by colour alone.
 SIGNS: Mapping[str, Mapping[str, Any]] = {
@@ -99,15 +104,22 @@ def benchmark_figure(cells: pd.DataFrame, *, thesis: pd.DataFrame) -> Figure:
 
 
 def _draw_heat_map(ax: Axes, table: pd.DataFrame) -> None:
-    """Draw percentages with noise levels below the columns, and system names above."""
-    values = table.to_numpy(float)
-    texts = ["–" if np.isnan(value) else f"{value:.0f}" for value in values.flat]
-    written, n_columns = style.draw_cells(ax, values, texts, 100.0), values.shape[1]
+    """Draw percentages as cells, with noise levels below the columns and system names above.
+
+    A cell is blue by its value, and white if it has none.
+    """
+    values, scale = table.to_numpy(float), Normalize(0.0, 100.0)
+    cells = np.ma.masked_invalid(values)
+    ax.pcolormesh(cells, cmap=CELLS, norm=scale, edgecolors="white", linewidth=0.8)
+    ax.tick_params(length=0)
     for row, published in enumerate(table.index.get_level_values(1)):
         if not published:
             ax.axhline(row, color="white", lw=3)  # gap between variants; thesis rows stay attached
-        for text in written[row * n_columns : (row + 1) * n_columns]:
-            text.set_fontstyle("italic" if published else "normal")
+        look: dict[str, Any] = {"style": "italic" if published else "normal", "fontsize": SMALL}
+        for column, value in enumerate(values[row]):
+            text = "–" if np.isnan(value) else f"{value:.0f}"
+            colour = "white" if scale(value) > DARK else "black"
+            ax.text(column + 0.5, row + 0.5, text, color=colour, ha="center", va="center", **look)
     noises = [f"{100 * noise:g}" for noise in table.columns.get_level_values(1)]
     style.name_ticks(ax.xaxis, np.arange(len(noises)) + 0.5, noises)
     ax.set(xlabel="noise (% of RMS)", ylim=(len(table), 0.0))

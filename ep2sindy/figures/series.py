@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.figures import style
@@ -242,6 +243,7 @@ def phase_figure(
 
 HISTORY = 0.5  # of the horizon, shown before the start
 FLOOR = 1e-3  # lowest error drawn, in standard deviations
+FEW_DECADES = 100.0  # ratio of the ends of an axis of errors with ticks inside its decades
 
 
 def forecast_figure(run: Trajectory, skill: ForecastSkill) -> Figure:
@@ -287,5 +289,9 @@ def _draw_errors(ax: Axes, skill: ForecastSkill) -> None:
         ax.plot(horizons, np.maximum(values, FLOOR), label=name, **look)
     ax.axhline(1.0, color=GREY, lw=0.8, ls="--")
     ax.set(yscale="log", ylabel="error (standard deviations)")
-    style.label_decades(ax)
+    low, high = ax.get_ylim()
+    steps = (1.0, 2.0, 5.0) if high < FEW_DECADES * low else (1.0,)
+    ax.yaxis.set_major_locator(LogLocator(subs=steps))
+    ax.yaxis.set_major_formatter(FormatStrFormatter("%g"))
+    ax.yaxis.set_minor_formatter(NullFormatter())
     ax.set_xlabel(f"horizon ({skill.unit})")

@@ -15,11 +15,9 @@ from jaxtyping import Float
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
-from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.text import Text
-from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter, ScalarFormatter
+from matplotlib.ticker import ScalarFormatter
 
 from ep2sindy.library.equations import latex_derivative, latex_name
 
@@ -35,10 +33,6 @@ MORE_COLOURS = (*COLOURS, "#7F3C8D", "#666666")
 # and legends are small; titles are as large as the labels of axes.
 WIDTH, TITLE, SMALL = 9.0, 10.0, 9.0
 
-# One hue from light to dark: legible with any colour vision, and in grey. A text on a shade beyond
-# DARK is white.
-CELLS, DARK = "Blues", 0.65
-
 Limits = tuple[float, float]
 
 Curve = tuple[Float[np.ndarray, " _"], Float[np.ndarray, " _"]]  # abscissa, ordinate
@@ -46,8 +40,6 @@ Curve = tuple[Float[np.ndarray, " _"], Float[np.ndarray, " _"]]  # abscissa, ord
 Sharing = bool | Literal["row", "col"]
 
 SIGN = "#555555"  # colour of legend marks, which stand for marks of any colour
-
-FEW_DECADES = 100.0  # ratio of the ends of a logarithmic axis with ticks inside its decades
 
 N_LINE = 60  # points on the line of a law
 
@@ -87,15 +79,6 @@ def make_row(n: int, *, width: float, height: float) -> tuple[Figure, Sequence[A
     size = (min(WIDTH, width * n + 0.4), height)
     figure, (axes,) = make_panels(1, n, size, sharex=True, sharey=True)
     return figure, [*axes]
-
-
-def label_decades(ax: Axes) -> None:
-    """Ticks of a logarithmic ordinate at 1, 2 and 5 of decades, or at decades if there are many."""
-    low, high = ax.get_ylim()
-    steps = (1.0, 2.0, 5.0) if high < FEW_DECADES * low else (1.0,)
-    ax.yaxis.set_major_locator(LogLocator(subs=steps))
-    ax.yaxis.set_major_formatter(FormatStrFormatter("%g"))
-    ax.yaxis.set_minor_formatter(NullFormatter())
 
 
 def name_ticks(axis: Axis, places: Iterable[float], names: Sequence[str]) -> None:
@@ -148,26 +131,6 @@ def legend_above(figure: Figure, handles: Sequence[Artist], *, title: str = "") 
     )  # fmt: skip
 
 
-def draw_cells(
-    ax: Axes, values: Float[np.ndarray, "rows columns"], texts: Sequence[str], most: float
-) -> list[Text]:
-    """Draw cells of unit sides with a text in each, blue by value from 0 to `most`, white for NaN.
-
-    texts: row by row. Returns them as drawn.
-    """
-    scale = Normalize(0.0, most)
-    grid: dict[str, Any] = {"edgecolors": "white", "linewidth": 0.8}
-    ax.pcolormesh(np.ma.masked_invalid(values), cmap=CELLS, norm=scale, **grid)
-    ax.tick_params(length=0)
-    centre: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": SMALL}
-    return [
-        ax.text(column + 0.5, row + 0.5, text, color="white" if dark else "black", **centre)
-        for ((row, column), dark), text in zip(
-            np.ndenumerate(np.asarray(scale(values) > DARK)), texts, strict=True
-        )
-    ]
-
-
 def axis_label(name: str, unit: str) -> str:
     return f"${latex_name(name)}$ ({unit_text(unit)})"
 
@@ -211,10 +174,7 @@ def unit_text(unit: str) -> str:
 
 
 def frame_limits(
-    data: Float[np.ndarray, " samples"],
-    models: Float[np.ndarray, " values"],
-    *,
-    rare: float = 0.0,
+    data: Float[np.ndarray, " samples"], models: Float[np.ndarray, " values"], *, rare: float = 0.0
 ) -> Limits:
     """Limits around data and models, within twice the data's range.
 

@@ -103,7 +103,5 @@ def by_place(place: str, value: Any) -> dict[str, Any]:
 
 def by_places(settings: Mapping[str, Any], keys: Collection[str]) -> dict[str, Any]:
     """The settings of these keys, each by its dotted key, groups by their name."""
-    found: dict[str, Any] = {}
-    for key in sorted({*keys} & {*settings} - {*ASIDE}):
-        found |= by_place(key, settings[key])
-    return found
+    used = sorted({*keys} & {*settings} - {*ASIDE})
+    return {at: value for key in used for at, value in by_place(key, settings[key]).items()}

@@ -12,7 +12,7 @@ from ep2sindy.library.relations import Constraint
 from ep2sindy.library.units import SECONDS, Clock, unit_product
 from ep2sindy.model.display import grouped
 from ep2sindy.model.model import SparseModel
-from ep2sindy.report.document import Block, Equation, Table
+from ep2sindy.report.document import Equation, Table
 
 NO_ENDS = (np.nan, np.nan)  # of an interval that is not known
 
@@ -44,18 +44,6 @@ def coefficients(models: Mapping[str, SparseModel]) -> pd.DataFrame:
         for term, value in model.terms(state).items()
     ]
     return pd.DataFrame(rows, columns=["model", "state", "term", "coef", "lower", "upper"])
-
-
-def model_blocks(
-    model: SparseModel,
-    clock: Clock = SECONDS,
-    *,
-    held: Constraint | None = None,
-    words: str = "95 %",
-    note: str = "",
-) -> list[Block]:
-    """The equations of a model, and the table of its intervals if they are known."""
-    return [*equations(model, clock, held=held), *interval_table(model, clock, words, note)]
 
 
 def equations(

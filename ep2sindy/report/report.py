@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,14 +15,14 @@ from ep2sindy.model.model import SparseModel
 from ep2sindy.report.about import About, by_places, settings_used
 from ep2sindy.report.document import Block, Captioned, Picture, Result, Section, Table, Text
 from ep2sindy.report.folder import RunFolder
-from ep2sindy.report.models import coefficients, model_blocks, model_facts
+from ep2sindy.report.models import coefficients, equations, interval_table, model_facts
 from ep2sindy.report.page import page_html
 from ep2sindy.report.picture import Drawn, draw
 from ep2sindy.report.results import TIMES, ResultTable, json_rows, on_clock
 from ep2sindy.report.screen import PAGE, Screen, renderables
 from ep2sindy.report.tensorboard import Board
 from ep2sindy.runtime.files import replacing, write_json, write_text
-from ep2sindy.runtime.progress import Advance, Bars, Progress, count_pieces
+from ep2sindy.runtime.progress import Bars, Progress, count_pieces
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -87,18 +86,23 @@ class Report:
         clock: Clock | None = None,
         held: Constraint | None = None,
         shown: bool = True,
+        words: str = "95 %",
+        note: str = "",
     ) -> None:
         """Add a model: models/NAME.json, its coefficients, its equations here and in the summary.
 
         clock: in whose time unit it is shown, by default the model's own. held: what its
-        coefficients obey, for equations by process. shown: False leaves it out of the page.
+        coefficients obey, for equations by process. shown: False leaves it out of the page. words,
+        note: on its intervals, see `interval_table`.
         """
         _once("model", name, self.models)
         model.save(self.folder.file(f"{name}.json", "models"))
         self.models[name] = model
         self.summary.setdefault("models", {})[name] = model_facts(model, held)
         if shown:
-            self.add(*model_blocks(model, clock or model.clock, held=held))
+            clock = clock or model.clock
+            self.add(*equations(model, clock, held=held))
+            self.add(*interval_table(model, clock, words, note))
 
     def table(
         self,
@@ -171,12 +175,6 @@ class Report:
         """Write a file of the study's own into the run folder, complete or not at all."""
         with replacing(self.folder.file(name)) as temporary:
             writer(temporary)
-
-    def progress(
-        self, total: int | None, unit: str, label: str = ""
-    ) -> AbstractContextManager[Advance]:
-        """A stage of the run, shown as a bar; see `Progress`."""
-        return self.watch.stage(total, unit, label)
 
     def finish(
         self, *, purpose: str = "", keys: Collection[str] = (), formats: Sequence[str] = ("png",)

@@ -169,12 +169,13 @@ def model_balance(
     named = {state.partition("@")[0] for state in model.states}
     if zones.balances and held_to.processes and named == {IONS, NEUTRALS}:
         processes = compared_processes(model, held_to, data, zones)
-    lesser = _each_left_out(model, held_to, by_process=bool(processes))
-    window = two_periods(train)
-    left_out = [
-        _without(model, less, train, held, bounds, progress, window=window)
-        for less in count_pieces(progress, lesser, "coefficient", "models without a term")
-    ]
+    lesser, window = _each_left_out(model, held_to, by_process=bool(processes)), two_periods(train)
+    left_out: list[Evaluation | None] = []
+    for less in count_pieces(progress, lesser, "coefficient", "models without a term"):
+        refined, run = _without(model, less, train, window, progress), None
+        if refined is not None:
+            run = evaluate(refined, held, initial=start_of(held, refined), bounds=bounds)
+        left_out.append(run)
     return ModelBalance(processes, _roles(model, held_to, processes, left_out))
 
 
@@ -192,27 +193,19 @@ def _roles(
             coef = model.terms(state).get(term, 0.0)
             found.append(TermRole(state, term, coef, not follows.any(), run))
         return found
-    by_process = {(ends_of(p), p.term): k for k, p in enumerate(held_to.processes)}
-    found = []
-    for each in processes:
-        for term, coef in each.coef.items():
-            k = by_process.get((each.ends, term))
-            run = None if k is None else left_out[k]
-            found.append(TermRole(each.name, term, coef, k is None, run, each))
-    return found
+    asked = [(ends_of(process), process.term) for process in held_to.processes]
+    runs = dict(zip(asked, left_out, strict=True))
+    places = [(each, term, (each.ends, term)) for each in processes for term in each.coef]
+    return [
+        TermRole(each.name, term, each.coef[term], at not in runs, runs.get(at), each)
+        for each, term, at in places
+    ]
 
 
 def _without(
-    model: SparseModel,
-    less: Constraint,
-    train: Trajectory,
-    held: Trajectory,
-    bounds: FreeRunBounds,
-    progress: Progress,
-    *,
-    window: int | None,
-) -> Evaluation | None:
-    """The model refined under a constraint with fewer terms, and run; None if it is not finite."""
+    model: SparseModel, less: Constraint, train: Trajectory, window: int | None, progress: Progress
+) -> SparseModel | None:
+    """The model refined under a constraint with fewer terms; None if it is not finite."""
     from ep2sindy.refinement.refine import refine, with_coef  # loads torch, only for a refinement
 
     if {state for state, _ in less.coefficients} != set(model.states):
@@ -222,9 +215,7 @@ def _without(
     found = refine(
         start, [train], window=window, constraint=less, n_reweights=0, seed=0, progress=progress
     )
-    if found.status == "non_finite":
-        return None
-    return evaluate(found.model, held, initial=start_of(held, found.model), bounds=bounds)
+    return None if found.status == "non_finite" else found.model
 
 
 def _each_left_out(
@@ -250,11 +241,10 @@ def _less(held_to: Constraint, free: int) -> Constraint:
     """The constraint without one free coefficient, and without those that follow from it alone."""
     C = np.delete(held_to.C, free, axis=1)
     kept = np.flatnonzero(C.any(axis=1) | (held_to.d != 0.0))
-    places = {int(k): new for new, k in enumerate(kept)}
     return Constraint(
         held_to.states,
         tuple(held_to.coefficients[k] for k in kept),
         C[kept],
         held_to.d[kept],
-        np.array([places[int(k)] for k in np.delete(held_to.free, free)], dtype=np.int64),
+        np.searchsorted(kept, np.delete(held_to.free, free)),
     )

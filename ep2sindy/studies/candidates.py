@@ -220,9 +220,8 @@ def add_estimate(report: Report, name: str, found: Discovery) -> None:
     report.section(f"{name}: noise of the samples, and other supports", level=3)
     if not found.noise_test.tested:
         report.add(Text(REPLACED, warning=True))
-    rows = ResultTable([estimate], ESTIMATE)
-    noise = Table(rows.screen(by_state=True), title="noise of the samples", note=NOISE)
-    report.table(f"samples_{name}", rows, by_state=True, shown=noise)
+    rows, title = ResultTable([estimate], ESTIMATE), "noise of the samples"
+    report.table(f"samples_{name}", rows, by_state=True, title=title, note=NOISE)
     report.add(Text(estimate.lack_of_fit or FITS, warning=bool(estimate.lack_of_fit)))
     if estimate.too_few_samples:
         report.add(Text(estimate.too_few_samples, warning=True))

@@ -52,13 +52,7 @@ from ep2sindy.studies.point_sources import Points, given_points
 from ep2sindy.studies.processes import Zones
 from ep2sindy.studies.source import DivergedError, Source, split_in_time, zones_of
 from ep2sindy.studies.structures import Structures
-from ep2sindy.studies.study import (
-    Count,
-    Fraction,
-    Positive,
-    PositiveOrAll,
-    ZeroOrMore,
-)
+from ep2sindy.studies.study import Count, Fraction, Positive, PositiveOrAll, ZeroOrMore
 from ep2sindy.studies.views import (
     EVALUATION,
     PlotRange,

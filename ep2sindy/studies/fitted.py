@@ -186,9 +186,7 @@ FITTED: Metrics[Fitted] = [
     Metric("r2", lambda fitted: fitted.r2, View.FILES | View.HEADLINE),
     Metric("loss", lambda fitted: fitted.refinement and fitted.refinement.loss),
     Metric(
-        "refinement",
-        lambda fitted: fitted.refinement and str(fitted.refinement.status),
-        View.SHOWN,
+        "refinement", lambda fitted: fitted.refinement and str(fitted.refinement.status), View.SHOWN
     ),
     Metric("cpu_s", lambda fitted: fitted.cpu_s, View.FILES | View.HEADLINE),
 ]

@@ -181,7 +181,7 @@ def find_law(
     if not trials:
         n = len(records)
         raise ValueError(f"{n} point{'s' * (n > 1)} that oscillate get no law: {reason}")
-    stage = report.progress(len(records), "point", "laws at points left out")
+    stage = report.watch.stage(len(records), "point", "laws at points left out")
     one = partial(_leave_out, trials=trials, periods=periods)
     errors = np.array(collect(workers, one, list(enumerate(records)), stage))
     trials = [replace(t, errors=own) for t, own in zip(trials, errors.T, strict=True)]
@@ -191,7 +191,7 @@ def find_law(
     if runs:
         fitted = [evaluate(read_law(law, r.parameters), r.from_slowest) for r in records]
         pieces = [at[first : first + N_TOGETHER] for first in range(0, len(at), N_TOGETHER)]
-        stage = report.progress(len(at), "point", "map of the law")
+        stage = report.watch.stage(len(at), "point", "map of the law")
         maps = collect(workers, partial(law_map, law, records), pieces, stage, size=len)
     known = [point for piece in maps for point in piece]
     n = len(points)

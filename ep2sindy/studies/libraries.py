@@ -32,10 +32,7 @@ from ep2sindy.signals.averaging import average_long
 from ep2sindy.signals.driving import DRIVE, add_drive, ask_whether_driven, drop_repeats
 from ep2sindy.signals.signal import prepare_signal
 from ep2sindy.studies.balance import ModelBalance, add_balance, model_balance
-from ep2sindy.studies.candidates import (
-    add_candidates,
-    add_estimate,
-)
+from ep2sindy.studies.candidates import add_candidates, add_estimate
 from ep2sindy.studies.forecasts import add_forecasts, skill_of, why_none
 from ep2sindy.studies.library_result import (
     LibraryResult,
@@ -46,19 +43,13 @@ from ep2sindy.studies.library_result import (
     refitted_model,
 )
 from ep2sindy.studies.processes import NO_ZONES, Zones
-from ep2sindy.studies.source import (
-    Source,
-    columns_beside,
-    n_before,
-    split_in_time,
-    zones_of,
-)
+from ep2sindy.studies.source import Source, columns_beside, n_before, split_in_time, zones_of
 from ep2sindy.studies.study import Coefficients, Fraction, PositiveOrAll, Terms, ZeroOrMore
 from ep2sindy.studies.sustained import (
     SustainedModel,
     SustainedSearch,
     add_sustained,
-    sustained_model,
+    start_of,
 )
 from ep2sindy.studies.views import PlotRange, add_figures, add_samples
 from ep2sindy.trust.user_code import load_user_module
@@ -159,7 +150,7 @@ class Study:
             )
 
     def run(self, report: Report) -> None:
-        with report.progress(None, "", "data"):
+        with report.watch.stage(None, "", "data"):
             fields = self.source.fields()
         cases = self._served_by(fields[0], report)
         runs, averaged = average_long(self._records(fields, cases, report), self.decimate)
@@ -289,13 +280,15 @@ class Study:
     ) -> tuple[SustainedModel, ModelBalance]:  # fmt: skip
         """The self-sustained model of a record, and the balance of its terms."""
         rows = Regression(self.formulation, bootstraps=self.bootstraps)
-        parts = split_in_time(run, self.held_out or HELD_OUT)
-        found = sustained_model(*parts, library, rows, settings, zones, rng=rng, progress=progress)
-        held_to = found.discovery.constraint
+        train, held = split_in_time(run, self.held_out or HELD_OUT)
+        found = settings.found(train, library, rows, zones, rng=rng, progress=progress)
+        model, bounds = found.model, settings.bounds
+        with progress.stage(None, "", "free run"):
+            free = evaluate(model, held, initial=start_of(held, model), bounds=bounds)
         beside = model_balance(
-            found.model, held_to, run, *parts, zones, settings.bounds, progress=progress
+            model, found.constraint, run, train, held, zones, bounds, progress=progress
         )
-        return found, beside
+        return SustainedModel(found, free), beside
 
     def _tell(
         self,

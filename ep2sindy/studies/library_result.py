@@ -136,33 +136,23 @@ def find_best(results: Mapping[str, LibraryResult], n_records: int) -> Result:
     sustained = {
         name: each.sustained for name, each in results.items() if each.sustained is not None
     }
-    if not sustained:
-        runs = {name: worst_run(each.runs) for name, each in results.items()}
-        best = best_run(runs)
-        test = results[best].discovery.noise_test
+    if sustained:
+        best = best_run({name: each.run for name, each in sustained.items()})
+        run, found = sustained[best].run, sustained[best].discovery
+        picture = "trajectories" if run.cycle is None else f"free_run_{best}"
         return found_model(
-            best,
-            runs[best],
-            file=best,
-            picture="trajectories",
-            where=f"the worst of {n_records} records" if n_records > 1 else "the record",
-            seen=True,
-            lack_of_fit=test.lack_of_fit,
-            more=[Text(test.note, warning=True)] if test.note else [],
-            held=results[best].discovery.constraint,
-        )
-    best = best_run({name: each.run for name, each in sustained.items()})
-    run = sustained[best].run
-    note = Text(f"{sustained[best].discovery.note}.")
+            best, run, file=f"{best}_sustained", picture=picture, more=[Text(f"{found.note}.")],
+            where="held-out time", held=found.constraint,
+        )  # fmt: skip
+    runs = {name: worst_run(each.runs) for name, each in results.items()}
+    best = best_run(runs)
+    found, test = results[best].discovery, results[best].discovery.noise_test
     return found_model(
-        best,
-        run,
-        file=f"{best}_sustained",
-        picture="trajectories" if run.cycle is None else f"free_run_{best}",
-        more=[note],
-        where="held-out time",
-        held=sustained[best].discovery.constraint,
-    )
+        best, runs[best], file=best, picture="trajectories", seen=True,
+        where=f"the worst of {n_records} records" if n_records > 1 else "the record",
+        lack_of_fit=test.lack_of_fit, held=found.constraint,
+        more=[Text(test.note, warning=True)] if test.note else [],
+    )  # fmt: skip
 
 
 def refit(

@@ -15,13 +15,7 @@ from ep2sindy.report.document import Result, Text
 from ep2sindy.report.models import equations
 from ep2sindy.report.report import Report
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View, percent
-from ep2sindy.studies.fitted import (
-    FITTED,
-    Fitted,
-    ends,
-    n_sustained,
-    worst_amplitude,
-)
+from ep2sindy.studies.fitted import FITTED, Fitted, ends, n_sustained, worst_amplitude
 from ep2sindy.studies.views import largest
 
 NOTE = (
@@ -95,16 +89,15 @@ def add_points(
     """
     if not found:
         raise ValueError("structures need a record to be fitted to: no operating point has one")
-    names = list(next(iter(found.values())))
-    over = {name: AtPoints([fits[name] for fits in found.values()]) for name in names}
-    first = next(iter(found.values())).values()
-    sources = {fit.name: fit.structure.source for fit in first}
-    report.section(f"{len(names)} fits at {len(found)} operating points")
+    first = next(iter(found.values()))
+    over = {name: AtPoints([fits[name] for fits in found.values()]) for name in first}
+    sources = {fit.name: fit.structure.source for fit in first.values()}
+    report.section(f"{len(over)} fits at {len(found)} operating points")
     draw = partial(sustained_figure, _rows(found), labels=labels)
     report.figure("sustained", draw, CAPTION)
     report.table("over_points", ResultTable(over, AT_POINTS), heading="fit", note=NOTE)
     report.section("Structures", *(f"{key}: {text}" for key, text in sources.items() if text))
-    rows = {f"{n}, {p}": fit for n in names for p, fit in zip(found, over[n].fits, strict=True)}
+    rows = {f"{n}, {p}": fit for n in over for p, fit in zip(found, over[n].fits, strict=True)}
     report.section("Every point")
     report.table("fits", ResultTable(rows, FITTED), heading="fit", page_only=True)
     for number, (point, fits) in enumerate(found.items()):

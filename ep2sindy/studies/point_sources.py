@@ -136,9 +136,9 @@ def expand(blocks: Sequence[Mapping[str, Any]], parameters: Sequence[str]) -> li
     """Every combination of the values of each block, with what else it holds."""
     found: list[dict[str, Any]] = []
     for block in blocks:
-        names = [name for name in parameters if name in block]
-        lists = [block[n] if isinstance(block[n], list) else [block[n]] for n in names]
-        found += [{**block, **dict(zip(names, at, strict=True))} for at in product(*lists)]
+        given = {name: block[name] for name in parameters if name in block}
+        lists = [value if isinstance(value, list) else [value] for value in given.values()]
+        found += [{**block, **dict(zip(given, at, strict=True))} for at in product(*lists)]
     return found
 
 
@@ -180,7 +180,7 @@ def open_points(
     sources: Sequence[PointSource], inputs: Sequence[str], *, workers: Workers, report: Report
 ) -> list[OpenedPoint]:
     """Open or simulate all points, and report their data and warnings."""
-    stage = report.progress(len(sources), "point opened")
+    stage = report.watch.stage(len(sources), "point opened")
     points = collect(workers, partial(PointSource.open, inputs=inputs), sources, stage)
     used = {point.label: point.used for point in points if point.used}
     if len(alike := {*used.values()}) == 1:  # all points are averaged alike
@@ -215,9 +215,8 @@ def _parameters(given: Mapping[str, Any], names: Sequence[str]) -> dict[str, flo
 
 def _changed(data: Deferred, places: Mapping[str, float], more: Mapping[str, Any]) -> Deferred:
     try:
-        data = data.changed(places)
+        return quiet(data.changed(places, more))
     except ValueError as error:
         raise ValueError(
             f"parameters must name numbers of the data group, or be null: {error}"
         ) from error
-    return quiet(data.changed({}, more))

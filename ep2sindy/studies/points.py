@@ -141,7 +141,18 @@ class Study:
                 opened, signal = embed_points(opened)
             models = self.models or self._search(opened, signal, report)
             library, given = self._given_models(models)
-            results = self._fit(opened, library, given, workers, report)
+            n_windows, periods = self._windows.n_windows, self._windows.periods
+            how = FittingSettings(library, self.formulation, n_windows, periods)
+            (rng, _) = np.random.default_rng(report.seed).spawn(2)
+            fitted = fit_models(
+                [point.run for point in opened], given, how, workers=workers, rng=rng,
+                tell=lambda k, result: report.board.scalars(_live(result), step=k),
+                progress=report.watch,
+            )  # fmt: skip
+            results = [
+                fitted.get(k, PointResult(point.parameters, point.status))
+                for k, point in enumerate(opened)
+            ]
             records = records_of(opened, results, report)
             try:
                 law = self._law(records, results, given, workers, report)
@@ -151,28 +162,6 @@ class Study:
                 law = None
                 report.warn(f"no law of whole models: {error}")
         self._report(report, results, records, library, given, law)
-
-    def _fit(
-        self,
-        opened: Sequence[OpenedPoint],
-        library: Library,
-        given: Mapping[str, GivenModel],
-        workers: Workers,
-        report: Report,
-    ) -> list[PointResult]:
-        """The fits of every point; none of one that does not oscillate."""
-        n_windows, periods = self._windows.n_windows, self._windows.periods
-        how = FittingSettings(library, self.formulation, n_windows, periods)
-        (rng, _) = np.random.default_rng(report.seed).spawn(2)
-        fitted = fit_models(
-            [point.run for point in opened], given, how, workers=workers, rng=rng,
-            tell=lambda k, result: report.board.scalars(_live(result), step=k),
-            progress=report.watch,
-        )  # fmt: skip
-        return [
-            fitted.get(k, PointResult(point.parameters, point.status))
-            for k, point in enumerate(opened)
-        ]
 
     def _law(
         self,

@@ -98,7 +98,7 @@ class Study:
         return PointSearch(self.states, library, self.method, self.least_variation, seed)
 
     def run(self, report: Report) -> None:
-        with report.progress(None, "", "data"):
+        with report.watch.stage(None, "", "data"):
             field = open_prepared(self.data, self.prepare)
         report_simulation(report, field.attrs)
         report_field(report, field)
@@ -119,46 +119,39 @@ class Study:
             )
         wall_s = time.perf_counter() - begin
         rng = np.random.default_rng(report.seed)
-        with report.progress(None, "", "regimes"):
+        with report.watch.stage(None, "", "regimes"):
             found = find_regimes(result, rng=rng, max_regimes=self.max_regimes)
         result = result.assign(regime=found.labels, confidence=found.confidence)
         packed = {str(name): {"zlib": True, "complevel": 4} for name in result.data_vars}
         write_netcdf(result, report.folder.file("pointwise.nc"), encoding=packed)
-        add_result(report, result, found, wall_s=wall_s, outline=self.outline)
+        report.found(found_regimes(found, count_points(report, result, wall_s)))
+        self._add_regimes(report, result, found)
 
-
-def add_result(
-    report: Report,
-    result: xr.Dataset,
-    regimes: Regimes,
-    *,
-    wall_s: float,
-    outline: Thruster | None = None,
-) -> None:
-    """Say what was found at the points, and add regimes and maps.
-
-    wall_s: duration of the search.
-    """
-    report.found(found_regimes(regimes, count_points(report, result, wall_s)))
-    report.summary |= {
-        "n_regimes": regimes.n_regimes,
-        "at_limit": regimes.at_limit,
-        "file": "pointwise.nc",
-        "no_fit": result.attrs["no_fit"] or None,
-        "equations": [regimes.equations(k) for k in range(regimes.n_regimes)],
-    }
-    report.headline["n_regimes"] = float(regimes.n_regimes)
-    apart = "A regime need not be connected: the same terms may act in places far apart."
-    report.section("Regimes", MEDIANS, Text(apart, page_only=True))
-    report.table("regimes", regimes.table, shown=False)
-    report.figure("regimes", partial(regime_map, regimes, outline=outline), CAPTIONS["regimes"])
-    for k in range(regimes.n_regimes):
-        _add_regime(report, regimes, k)
-    report.section("Maps")
-    if (result["n_terms"] > 0).any():
-        caption = LINE_CAPTION if result["status"].ndim == 1 else CAPTIONS["coefficients"]
-        report.figure("coefficients", partial(coefficient_maps, result, outline=outline), caption)
-    report.figure("quality", partial(quality_maps, result, outline=outline), CAPTIONS["quality"])
+    def _add_regimes(self, report: Report, result: xr.Dataset, regimes: Regimes) -> None:
+        """Add the regimes, and the maps of what was found at the points."""
+        n_regimes, outline = regimes.n_regimes, self.outline
+        report.summary |= {
+            "n_regimes": n_regimes,
+            "at_limit": regimes.at_limit,
+            "file": "pointwise.nc",
+            "no_fit": result.attrs["no_fit"] or None,
+            "equations": [regimes.equations(k) for k in range(n_regimes)],
+        }
+        report.headline["n_regimes"] = float(n_regimes)
+        apart = "A regime need not be connected: the same terms may act in places far apart."
+        report.section("Regimes", MEDIANS, Text(apart, page_only=True))
+        report.table("regimes", regimes.table, shown=False)
+        draw = partial(regime_map, regimes, outline=outline)
+        report.figure("regimes", draw, CAPTIONS["regimes"])
+        for k in range(n_regimes):
+            _add_regime(report, regimes, k)
+        report.section("Maps")
+        if (result["n_terms"] > 0).any():
+            caption = LINE_CAPTION if result["status"].ndim == 1 else CAPTIONS["coefficients"]
+            draw = partial(coefficient_maps, result, outline=outline)
+            report.figure("coefficients", draw, caption)
+        draw = partial(quality_maps, result, outline=outline)
+        report.figure("quality", draw, CAPTIONS["quality"])
 
 
 def count_points(report: Report, result: xr.Dataset, wall_s: float) -> str:

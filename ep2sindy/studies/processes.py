@@ -128,10 +128,7 @@ class ComparedProcess:
 
 
 def compared_processes(
-    model: SparseModel,
-    held_to: Constraint,
-    data: Trajectory,
-    zones: Zones,
+    model: SparseModel, held_to: Constraint, data: Trajectory, zones: Zones
 ) -> list[ComparedProcess]:
     """The processes of ions and neutrals, in zones and between them, in record and model.
 

@@ -11,12 +11,7 @@ import pandas as pd
 from ep2sindy.figures.operating import rows_at, trends_figure
 from ep2sindy.library.library import Library
 from ep2sindy.operating.given_models import REFINED, GivenModel, PointResult
-from ep2sindy.operating.quantities import (
-    ControlLaw,
-    control_functions,
-    fit_control_law,
-    lines_of,
-)
+from ep2sindy.operating.quantities import ControlLaw, control_functions, fit_control_law, lines_of
 from ep2sindy.report.document import Equation, Result
 from ep2sindy.report.report import Report
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View, percent

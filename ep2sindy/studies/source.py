@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -100,7 +101,7 @@ class Source:
 
     def opened(self, libraries: Iterable[Library], report: Report) -> tuple[xr.Dataset, Trajectory]:
         """The single record, and its trajectory as `sampled` makes it."""
-        with report.progress(None, "", "data"):
+        with report.watch.stage(None, "", "data"):
             field = self.field()
         return field, self.sampled(field, libraries, report)
 
@@ -126,21 +127,16 @@ def zones_of(source: Source, field: xr.Dataset, report: Report) -> Zones:
     Balances that cannot be made, as of a zone that reaches into the plume, are reported.
     """
     sampling = source.trajectory
-    return Zones(_balances(sampling, field, report), sampling.sizes(field))
-
-
-def _balances(sampling: ZoneAverage, field: xr.Dataset, report: Report) -> dict[str, xr.Dataset]:
-    if not {IONS, NEUTRALS} <= set(field.data_vars):
-        return {}
-    zones = sampling.parts(field)
+    zones = sampling.parts(field) if {IONS, NEUTRALS} <= set(field.data_vars) else {}
     if any(zone.r is not None or isinstance(zone.z, float) for zone in zones.values()):
-        return {}
+        zones = {}
+    balance = partial(zone_balance, field, axisymmetric=sampling.axisymmetric)
     try:
-        axisymmetric = sampling.axisymmetric
-        return {n: zone_balance(field, z, axisymmetric=axisymmetric) for n, z in zones.items()}
+        balances = {name: balance(zone) for name, zone in zones.items()}
     except ValueError as error:
         report.say(f"the model has no balance of its zone next to it: {error}")
-        return {}
+        balances = {}
+    return Zones(balances, sampling.sizes(field))
 
 
 def report_field(report: Report, field: xr.Dataset) -> None:

@@ -62,11 +62,7 @@ def _is_positive(value: Any) -> bool:
     return _is_number(value) and value > 0
 
 
-def _is_count(value: Any) -> bool:
-    return type(value) is int and value >= 1
-
-
-Count = Annotated[int, Check("a whole number, one or more", _is_count)]
+Count = Annotated[int, Check("a whole number, one or more", lambda x: type(x) is int and x >= 1)]
 ZeroOrMore = Annotated[
     int, Check("a whole number, zero or more", lambda x: type(x) is int and x >= 0)
 ]

@@ -17,7 +17,7 @@ from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.method import Regression
 from ep2sindy.discovery.result import Discovery
 from ep2sindy.figures import free_run as figures
-from ep2sindy.forecasting.evaluation import Evaluation, evaluate
+from ep2sindy.forecasting.evaluation import Evaluation
 from ep2sindy.forecasting.skill import ForecastSkill
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.library.roles import Roles
@@ -25,7 +25,6 @@ from ep2sindy.model.comparison import FreeRunBounds
 from ep2sindy.model.mass_action import consequences
 from ep2sindy.model.model import SparseModel
 from ep2sindy.regression.searches import Search
-from ep2sindy.report.models import model_blocks
 from ep2sindy.report.report import Report
 from ep2sindy.report.results import Metric, Metrics
 from ep2sindy.runtime.progress import SILENT, Progress
@@ -171,15 +170,15 @@ def add_sustained(report: Report, name: str, found: SustainedModel) -> None:
     model, clock, run = found.model, found.run.rollout.clock, found.run
     held_to = found.discovery.constraint
     report.section(f"{name}: the model that free runs select ({run.text})")
-    report.model(f"{name}_sustained", model, clock=clock, held=held_to, shown=False)
-    report.add(*model_blocks(model, clock, held=held_to, words=SPREAD, note=SPREAD_NOTE))
+    file = f"{name}_sustained"
+    report.model(file, model, clock=clock, held=held_to, words=SPREAD, note=SPREAD_NOTE)
     if run.cycle is not None:
         period_s = run.cycle.period_s
         draw = partial(figures.free_run_figure, run.record, run.rollout, period_s=period_s)
         report.figure(f"free_run_{name}", draw, CAPTIONS["free_run"])
     report.add(_notes(found))
     add_cycle(report, name, run)
-    add_samples(report, run.record, {f"{name}_sustained": run})
+    add_samples(report, run.record, {file: run})
 
 
 def add_cycle(report: Report, name: str, run: Evaluation) -> None:
@@ -197,25 +196,6 @@ def _notes(found: SustainedModel) -> str:
     notes += [found.run.cycle_text] if found.run.cycle_text else []
     notes += [f"Lack of fit: {found.discovery.lack_of_fit}."] if found.discovery.lack_of_fit else []
     return " ".join(notes)
-
-
-def sustained_model(
-    train: Trajectory,
-    held: Trajectory,
-    library: Library,
-    rows: Regression,
-    settings: SustainedSearch,
-    zones: Zones,
-    *,
-    rng: np.random.Generator,
-    progress: Progress = SILENT,
-) -> SustainedModel:
-    """Find a self-sustained model in one part of a record, and run it over the other."""
-    found = settings.found(train, library, rows, zones, rng=rng, progress=progress)
-    with progress.stage(None, "", "free run"):
-        start = start_of(held, found.model)
-        run = evaluate(found.model, held, initial=start, bounds=settings.bounds)
-    return SustainedModel(found, run)
 
 
 def start_of(run: Trajectory, model: SparseModel) -> np.ndarray:
