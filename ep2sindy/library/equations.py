@@ -63,9 +63,7 @@ def latex_term_name(name: str) -> str:
 
 def _latex_factor(part: Part) -> str:
     argument = part.argument_of(latex_name(part.variable), times=r" \, ")
-    if not part.function:
-        return latex_name(part.variable)
-    if part.function == RECIPROCAL:
+    if part.function in ("", RECIPROCAL):
         return argument if part.is_bare else f"({argument})"
     if part.function == "sqrt":
         root = rf"\sqrt{{{argument}}}"
@@ -169,33 +167,29 @@ def _html_term(name: str, size: float, half_width: float | None, digits: int) ->
     return f"{_number_html(size, digits)}{error} {term}".strip()
 
 
-def sum_latex(terms: Sum, *, digits: int = 3) -> str:
-    r"""LaTeX of the right-hand side of an equation: `- 2.62 \cdot 10^{5} \, n_{i} + ...`."""
-    return " ".join(terms_latex(terms, digits=digits)) or "0"
-
-
 def terms_latex(terms: Sum, *, digits: int = 3) -> list[str]:
-    """LaTeX of every term, or group of terms, with its sign; a factor of one is not written."""
+    r"""LaTeX of every term, or group of terms, with its sign: `- 2.62 \cdot 10^{5} \, n_{i}`.
+
+    A factor of one is not written.
+    """
     return _parts_in(LATEX, terms, digits)
 
 
 def equations_latex(equations: Mapping[str, Sum], *, digits: int = 3) -> str:
     """LaTeX `aligned` block with one equation per line. equations: state -> terms."""
     lines = (
-        f"{latex_derivative(state)} &= {sum_latex(terms, digits=digits)}"
+        f"{latex_derivative(state)} &= {' '.join(terms_latex(terms, digits=digits)) or 0}"
         for state, terms in equations.items()
     )
     return "\\begin{aligned}\n" + " \\\\\n".join(lines) + "\n\\end{aligned}"
 
 
-def equation_html(
-    state: str, terms: Sum, *, digits: int = 3, reach: Mapping[str, float] = NOTHING
-) -> str:
-    """HTML of one equation, with sub- and superscripts.
+def equation_html(state: str, terms: Sum, *, reach: Mapping[str, float] = NOTHING) -> str:
+    """HTML of one equation, with sub- and superscripts, to three digits.
 
     terms: or groups of them. reach: half-width of the confidence interval by term name.
     """
-    right = " ".join(_parts_in(HTML, terms, digits, reach)) or "0"
+    right = " ".join(_parts_in(HTML, terms, 3, reach)) or "0"
     return f"d{_variable_html(state)}/dt = {right}".replace("-", "&minus;")
 
 
@@ -271,10 +265,8 @@ def _term_html(name: str) -> str:
 
 def _part_html(part: Part) -> str:
     argument = part.argument_of(_variable_html(part.variable), times=" ")
-    if part.function == RECIPROCAL:
-        text = argument if part.is_bare else f"({argument})"
-    else:
-        text = f"{html.escape(part.function)}({argument})" if part.function else argument
+    function = html.escape(part.function.removeprefix(RECIPROCAL))
+    text = f"{function}({argument})" if function or not part.is_bare else argument
     return text + (f"<sup>{part.power}</sup>" if part.power > 1 else "")
 
 

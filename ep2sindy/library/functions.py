@@ -14,10 +14,11 @@ from typing import Any
 
 import numpy as np
 from array_api_compat import array_namespace, is_numpy_array
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from ep2sindy.library.names import RECIPROCAL, Part, number_text
 from ep2sindy.library.units import unit_product
+from ep2sindy.runtime.values import Mask, Samples
 
 Values = Callable[[Any], Any]
 Interval = tuple[float, float]
@@ -107,9 +108,7 @@ class Function:
         argument = self.scale * x + self.shift
         return next(((low, high) for low, high in self.kind.domain if low < argument < high), None)
 
-    def keep_inside(
-        self, x: Float[np.ndarray, " samples"], margin: float
-    ) -> Float[np.ndarray, " samples"]:
+    def keep_inside(self, x: Samples, margin: float) -> Samples:
         """Move values of the variable into the interval of the domain that holds their median.
 
         They end no nearer to its ends than a margin.
@@ -118,9 +117,7 @@ class Function:
         low, high = sorted((end - self.shift) / self.scale for end in home)
         return np.clip(x, low + margin, high - margin)
 
-    def misplaced(
-        self, x: Float[np.ndarray, " samples"], beside: Float[np.ndarray, " _"]
-    ) -> Bool[np.ndarray, " samples"]:
+    def misplaced(self, x: Samples, beside: Samples) -> Mask:
         """Mask of the values x of the variable at which the function cannot be used.
 
         These values do not lie in the same interval of the domain as `next to`, or give an f or f'

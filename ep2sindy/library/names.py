@@ -103,9 +103,8 @@ class Part:
     @property
     def text(self) -> str:
         """Factor without its power: `x`, `sin(2*x)`, `1/x`, `1/(0.5+x)`."""
-        if self.function != RECIPROCAL:
-            return f"{self.function}({self.argument})" if self.function else self.variable
-        return f"1/{self.argument}" if self.is_bare else f"1/({self.argument})"
+        is_call = self.function not in ("", RECIPROCAL) or not self.is_bare
+        return self.function + (f"({self.argument})" if is_call else self.argument)
 
 
 def number_text(value: float) -> str:

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float
 
 from ep2sindy.data.gaps import between_gaps, mean_step
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.runtime.values import Columns, Samples
 from ep2sindy.signals.attractor import find_cycle
 from ep2sindy.signals.spectrum import crossing_frequency, lost_in_means
 
@@ -86,7 +86,7 @@ def count_spare(run: Trajectory) -> int:
     return 1
 
 
-def _samples_in_period(t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samples"]) -> float:
+def _samples_in_period(t: Samples, x: Samples) -> float:
     """Mean number of samples in a period, or from one rise to the next; zero without a rise."""
     cycle = find_cycle(t, x[:, None])
     frequency_Hz = crossing_frequency(t, x) if cycle is None else cycle.frequency_Hz
@@ -121,9 +121,7 @@ def _means(run: Trajectory, factor: int) -> Trajectory:
     return replace(run, t=mean(run.t), states=mean(run.states), inputs=inputs)
 
 
-def _centred(
-    inputs: Float[np.ndarray, "samples n_inputs"],
-) -> Float[np.ndarray, "samples n_inputs"]:
+def _centred(inputs: Columns) -> Columns:
     """Inputs as they are on average over a step about every sample.
 
     One that most samples repeat is held from each to the next, so half of that step lies before.

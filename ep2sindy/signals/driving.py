@@ -19,10 +19,9 @@ from ep2sindy.data.runs import Run, trajectory_of
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library
 from ep2sindy.library.units import Clock, seconds_in
-from ep2sindy.runtime.values import check_positive
+from ep2sindy.runtime.values import Samples, check_positive
 from ep2sindy.signals.attractor import Cycle, find_cycle
 from ep2sindy.signals.signal import Signal
-from ep2sindy.signals.spectrum import Samples
 
 DRIVE = ("cos_drive", "sin_drive")  # inputs that stand for a drive of known period
 

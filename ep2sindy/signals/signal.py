@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
 
 from ep2sindy.data.gaps import mean_step
 from ep2sindy.data.runs import Run, trajectory_of
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.units import Clock
+from ep2sindy.runtime.values import Samples
 from ep2sindy.signals.attractor import Cycle, find_cycle, white_variance
 from ep2sindy.signals.averaging import average_alike
 from ep2sindy.signals.spectrum import (
@@ -64,11 +64,11 @@ class Signal:
     advice: tuple[str, ...] = ()
 
     @property
-    def t(self) -> Float[np.ndarray, " samples"]:
+    def t(self) -> Samples:
         return self.run.t
 
     @property
-    def x(self) -> Float[np.ndarray, " samples"]:
+    def x(self) -> Samples:
         """The samples, in `unit`."""
         return self.run.states[:, 0]
 
@@ -158,17 +158,8 @@ def prepare_signal(
     if not (isinstance(detrend, bool) or detrend == "auto"):
         raise ValueError(f"detrend must be auto, true or false: got {detrend!r}")
     t, evened = _restore_even_times(run.t)
-    own = Trajectory(
-        t=t,
-        states=run.columns([name]),
-        state_names=(name,),
-        inputs=run.inputs,
-        input_names=run.input_names,
-        units=run.units,
-        label=name,
-        clock=run.clock,
-        parameters=run.parameters,
-    )
+    x, names = run.columns([name]), (name,)
+    own = replace(run, t=t, states=x, state_names=names, label=name, missing=None)
     (own,), averaged = average_alike([own], decimate)
     t, x = own.t, own.states[:, 0]
     cycle = find_cycle(t, x[:, None])
@@ -184,7 +175,7 @@ def prepare_signal(
     return found
 
 
-def is_positive(t: Float[np.ndarray, " samples"], x: Float[np.ndarray, " samples"]) -> bool:
+def is_positive(t: Samples, x: Samples) -> bool:
     """Return true if the signal is positive at all times, apart from white noise in its samples."""
     lowest = float(x.min())
     if lowest > 0.0:

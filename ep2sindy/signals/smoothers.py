@@ -19,8 +19,8 @@ from scipy.linalg.lapack import dgbtrf, dgbtrs, dpbtrf, dtbtrs
 
 from ep2sindy.data.numbers import least_beside_grid, zero_to_one
 from ep2sindy.data.trajectory import check_time
-from ep2sindy.runtime.values import check_positive, read_only
-from ep2sindy.signals.spectrum import Samples, is_uniform
+from ep2sindy.runtime.values import Columns, Samples, check_positive, read_only
+from ep2sindy.signals.spectrum import is_uniform
 
 # The range extends from a memory of about 200 samples to interpolation.
 LOG10_RATIO_MIN, LOG10_RATIO_MAX = -14.0, 4.0
@@ -45,8 +45,6 @@ WELL_CONDITIONED = 5e-11
 WIDTH = 5  # of the band on either side of the diagonal
 
 BLOCK = 262_144  # samples that are differentiated at once
-
-Columns = Float[np.ndarray, "samples columns"]
 
 
 @runtime_checkable
