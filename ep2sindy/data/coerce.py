@@ -82,13 +82,11 @@ def keep_inside(library: Library, moved: Columns, samples: Columns) -> Columns:
     moved: modified samples, such as smoothed ones. A value that leaves a function's domain is
     replaced by the one in `samples`. Columns: first the library's variables, then any others.
     """
-    kept = moved
+    kept = moved.copy() if library.functions else moved
     for function in library.functions:
         v = library.variables.index(function.variable)
         wrong = function.misplaced(moved[:, v], samples[:, v])
-        if wrong.any():
-            kept = kept.copy() if kept is moved else kept
-            kept[wrong, v] = samples[wrong, v]
+        kept[wrong, v] = samples[wrong, v]
     return kept
 
 

@@ -11,7 +11,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, TypeAlias
 
 from ep2sindy.library.names import RECIPROCAL, Part, split_term
-from ep2sindy.library.processes import Group
+from ep2sindy.library.roles import Group
 
 if TYPE_CHECKING:
     import sympy

@@ -1,18 +1,32 @@
-"""Reader of HDF5 files of any layout."""
+"""Readers of files of named arrays: HDF5 of any layout, NetCDF, Zarr, MATLAB and NumPy's npz.
+
+Values are read when they are used, except those of old MATLAB files.
+"""
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from math import ceil, prod
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
+from zipfile import ZipFile
 
 import numpy as np
 import xarray as xr
 from xarray.backends import BackendArray
 from xarray.core import indexing
 
-from ep2sindy.data.blocks import AT_ONCE, UNDECODED
-from ep2sindy.data.readers.source import PACKED_BY, FileSource, Reader, check_packing, plain
+from ep2sindy.data.blocks import AT_ONCE, unpack
+from ep2sindy.data.readers.source import (
+    PACKED_BY,
+    FileSource,
+    Reader,
+    check_packing,
+    dataset_source,
+    leaves,
+    plain,
+)
+from ep2sindy.runtime.files import check_regular
 from ep2sindy.trust.memory import check_memory
 
 if TYPE_CHECKING:
@@ -51,9 +65,7 @@ def read_hdf5(path: Path) -> FileSource:
             array, attrs = stored_array(path, found), _attributes(found, name)
             array = array[0] if _has_modes(found) else array
         unit = attrs.pop("units")
-        packed = xr.Dataset({"it": array.assign_attrs(attrs)})
-        decoded = xr.decode_cf(packed, decode_coords=False, **UNDECODED)["it"]
-        return decoded.drop_attrs().assign_attrs(units=unit)
+        return unpack(array, attrs).assign_attrs(units=unit)
 
     names = names_in_hdf5(path)
     beside = {name: array for name, array in beside.items() if name not in names}
@@ -170,9 +182,6 @@ def stored_array(path: Path, found: h5py.Dataset) -> xr.DataArray:
         raise ValueError(f"{found.name!r} is empty: its dataspace is null, and holds no values")
     if found.dtype.kind not in "iufb":
         return xr.DataArray(found[()])
-    # One mark for each chunk says if it was written.
-    n_bytes = float(prod(_counts(found)))
-    check_memory(n_bytes, repr(found.name), hint="copy the part that you need into a file")
     stored = _Stored(path, found)
     if not stored.written.any():
         raise ValueError(f"{found.name!r} was never written: the file holds its shape alone")
@@ -186,7 +195,11 @@ def stored_array(path: Path, found: h5py.Dataset) -> xr.DataArray:
 def _written(found: h5py.Dataset) -> tuple[np.ndarray, tuple[int, ...]]:
     """Which chunks of a data set were written, over the grid of its chunks, and their shape."""
     chunks = found.chunks or tuple(max(n, 1) for n in found.shape)
-    written = np.ones(_counts(found), dtype=bool)
+    counts = [ceil(n / step) for n, step in zip(found.shape, chunks, strict=True)]
+    # One mark for each chunk says if it was written.
+    hint = "copy the part that you need into a file"
+    check_memory(float(prod(counts)), repr(found.name), hint=hint)
+    written = np.ones(counts, dtype=bool)
     if not found.size or not found.shape or found.dtype.kind not in "iuf" or found.is_virtual:
         return written, chunks
     if found.chunks is None:
@@ -198,12 +211,6 @@ def _written(found: h5py.Dataset) -> tuple[np.ndarray, tuple[int, ...]]:
         for start in starts:
             written[tuple(k // step for k, step in zip(start, chunks, strict=True))] = True
     return written, chunks
-
-
-def _counts(found: h5py.Dataset) -> list[int]:
-    """Number of chunks along each axis; one where the values are not divided into chunks."""
-    chunks = found.chunks or tuple(max(n, 1) for n in found.shape)
-    return [ceil(n / step) for n, step in zip(found.shape, chunks, strict=True)]
 
 
 def _attributes(found: h5py.Dataset, name: str) -> dict[str, Any]:
@@ -237,3 +244,124 @@ def _plain(value: Any) -> Any:
 
 
 HDF5 = Reader("HDF5", read_hdf5, form="hdf5")
+
+
+# NetCDF and Zarr.
+
+
+# Default fill values, which the netCDF library returns for numbers that were never written unless
+# an attribute sets another. Bytes have none. Source: netcdf.h, NC_FILL_SHORT and its kin.
+FILLS = {
+    "i2": -32767, "u2": 65535, "i4": -2147483647, "u4": 4294967295,
+    "i8": -9223372036854775806, "u8": 18446744073709551614,
+    "f4": 9.969209968386869e36, "f8": 9.969209968386869e36,
+}  # fmt: skip
+
+
+def read_netcdf(path: Path) -> FileSource:
+    """Open NetCDF 3 or 4; samples never written are NaN.
+
+    Raises ValueError for a classic file that is shorter than its values.
+    """
+    with path.open("rb") as file:
+        head = file.read(4)
+    if head == b"CDF\x05" and find_spec("netCDF4") is None:
+        raise ValueError("it is CDF-5, which an extra reads: pip install 'ep2sindy[files]'")
+    engine: Literal["scipy", "h5netcdf", "netcdf4"] = "h5netcdf"
+    if head.startswith(b"CDF"):  # in a truncated file the netCDF library reads on; SciPy raises
+        engine = "netcdf4" if head == b"CDF\x05" else "scipy"
+    dataset = xr.open_dataset(path, engine=engine, decode_cf=False)
+    size = path.stat().st_size
+    if head.startswith(b"CDF") and dataset.nbytes > size:
+        raise ValueError(
+            f"it is cut short: its values take {dataset.nbytes} bytes, and it has {size}"
+        )
+    for variable in dataset.variables.values():
+        kind = variable.dtype.str[1:]
+        if kind in FILLS and not {"_FillValue", "missing_value"} & set(variable.attrs):
+            variable.attrs["_FillValue"] = variable.dtype.type(FILLS[kind])
+    return dataset_source(path, dataset)
+
+
+def read_zarr(path: Path) -> FileSource:
+    """Open a Zarr store in a folder, with named dimensions as xarray writes it.
+
+    Pickled objects are refused by numcodecs, from the release on that the extra asks for.
+    """
+    check_regular(path)
+    dataset = xr.open_dataset(path, engine="zarr", consolidated=False, decode_cf=False)
+    return dataset_source(path, dataset)
+
+
+NETCDF = Reader(
+    "NetCDF", read_netcdf, first_bytes=(b"CDF",), form="hdf5", endings=(".nc", ".nc4", ".cdf")
+)
+ZARR = Reader("Zarr", read_zarr, form="folder", endings=(".zarr",), package="zarr")
+
+
+# MATLAB, up to v7 and v7.3.
+
+
+V73 = b"MATLAB 7.3"
+
+
+def read_matlab(path: Path) -> FileSource:
+    """Read a MATLAB file of either format; a struct's field is named "data.n_i"."""
+    with path.open("rb") as file:
+        return _read_v73(path) if file.read(len(V73)) == V73 else _read_old(path)
+
+
+def _read_v73(path: Path) -> FileSource:
+    """Read MATLAB v7.3, which is HDF5 with reversed axes."""
+    import h5py
+
+    def read(name: str) -> xr.DataArray:
+        with h5py.File(path) as file:
+            found = file[name.replace(".", "/")]
+            kind = found.attrs.get("MATLAB_class", b"object").decode()
+            if "MATLAB_object_decode" in found.attrs or found.dtype.hasobject:
+                raise ValueError(
+                    f"{name!r} is a MATLAB {kind}, of which the file holds references: save its "
+                    f"columns as arrays, or writetable({name}, 'run.csv')"
+                )
+            return stored_array(path, found).T
+
+    names = [name for name in names_in_hdf5(path) if not name.startswith("#refs#")]
+    return FileSource(path, [name.replace("/", ".") for name in names], read)
+
+
+def _read_old(path: Path) -> FileSource:
+    """Read MATLAB up to v7."""
+    from scipy.io import loadmat
+
+    content = loadmat(path, simplify_cells=True)
+    arrays = leaves({name: value for name, value in content.items() if not name.startswith("__")})
+    return FileSource(path, list(arrays), lambda name: xr.DataArray(np.asarray(arrays[name])))
+
+
+MATLAB = Reader("MATLAB (v5, v7.3)", read_matlab, first_bytes=(b"MATLAB 5.0", V73))
+
+
+# NumPy archives.
+
+
+def read_npz(path: Path) -> FileSource:
+    """Read NumPy arrays saved with `numpy.savez`; pickled objects are refused."""
+
+    def read(name: str) -> xr.DataArray:
+        with np.load(path, allow_pickle=False) as arrays:
+            return xr.DataArray(arrays[name])
+
+    with ZipFile(path) as archive:
+        for member in archive.infolist():
+            check_memory(float(member.file_size), repr(member.filename), hint="divide it")
+            if not member.filename.endswith(".npy"):
+                raise ValueError(
+                    f"an archive must hold arrays of NumPy alone: it holds {member.filename!r}; "
+                    "unpack it, and name the file in it"
+                )
+    with np.load(path, allow_pickle=False) as arrays:
+        return FileSource(path, list(arrays), read)
+
+
+NPZ = Reader("npz", read_npz, form="zip")
