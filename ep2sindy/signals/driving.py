@@ -155,9 +155,8 @@ class PhaseRecord:
     @property
     def has_moving_phase(self) -> bool:
         """Whether the phase moves from period to period by more than noise explains."""
-        return (
-            len(self.phase) >= MIN_PERIODS_OF_PHASE and self.moved > 2.0 * LEAST_MOVES * self.noise
-        )
+        least = 2.0 * LEAST_MOVES * self.noise
+        return len(self.phase) >= MIN_PERIODS_OF_PHASE and self.moved > least
 
     @property
     def returns(self) -> bool:
@@ -292,10 +291,8 @@ def describe_set(t: Samples, u: Samples, others: Sequence[Samples]) -> str:
     wave = np.column_stack([np.ones(len(t)), np.cos(cycle.phase), np.sin(cycle.phase)])
     columns = np.column_stack([u, *others])
     coef = np.linalg.lstsq(wave, columns, rcond=None)[0]
-    impure, lines = (
-        (columns - wave @ coef).var(axis=0) / columns.var(axis=0),
-        coef[1] - 1j * coef[2],
-    )
+    impure = (columns - wave @ coef).var(axis=0) / columns.var(axis=0)
+    lines = coef[1] - 1j * coef[2]
     leads = ((lines[1:] * lines[0].conj()).imag < 0.0).all()
     return SINE if impure[0] < PURE and leads and (PURER * impure[0] < impure[1:]).all() else ""
 
