@@ -402,10 +402,16 @@ def check_agreement(trajectories: Sequence[Trajectory], variables: Sequence[str]
     for k, run in enumerate(trajectories):
         missing = [name for name in names if name not in run.names]
         if missing or run.state_names != first.state_names:
+            way = "give all of them the same states, named alike and in the same order"
+            if lacking := [name for name in missing if name not in first.state_names]:
+                way = (
+                    f"the library needs {lacking}: sample it as a state or pass it as an input, "
+                    "leave its terms out, or derive it (+exp=trace does, of one signal)"
+                )
             raise ValueError(
                 f"every trajectory needs the states {list(first.state_names)} and the variables "
                 f"{list(variables)}: trajectory {k} has states {list(run.state_names)} and inputs "
-                f"{list(run.input_names)}; {_way_to_agree(first, missing)}"
+                f"{list(run.input_names)}; {way}"
             )
         for name in (*names, *run.parameters):
             if run.units[name] != first.units.get(name, run.units[name]):
@@ -413,16 +419,6 @@ def check_agreement(trajectories: Sequence[Trajectory], variables: Sequence[str]
                     f"units must agree: {name!r} is in {first.units[name]} in trajectory 0 and "
                     f"in {run.units[name]} in trajectory {k}; convert one of them first"
                 )
-
-
-def _way_to_agree(first: Trajectory, missing: Sequence[str]) -> str:
-    """What to do about a trajectory that lacks variables, or whose states are others."""
-    if lacking := [name for name in missing if name not in first.state_names]:
-        return (
-            f"the library needs {lacking}: sample it as a state or pass it as an input, leave its "
-            "terms out, or derive it (+exp=trace does, of one signal)"
-        )
-    return "give all of them the same states, named alike and in the same order"
 
 
 def spread_blocks(runs: Sequence[Trajectory], *, most: int, block: int) -> list[Trajectory]:

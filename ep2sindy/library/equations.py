@@ -54,11 +54,12 @@ def latex_term_name(name: str) -> str:
 
     Quotients become fractions: `x*sin(y)/z` -> `\frac{x \, \sin(y)}{z}`.
     """
-    above, below = _sides(name)
-    over, under = (
-        r" \, ".join(_latex_factor(p) + _latex_power(p) for p in side) for side in (above, below)
-    )
-    return rf"\frac{{{over or 1}}}{{{under}}}" if below else over or name
+    over, under = (r" \, ".join(map(_latex_part, side)) for side in _sides(name))
+    return rf"\frac{{{over or 1}}}{{{under}}}" if under else over or name
+
+
+def _latex_part(part: Part) -> str:
+    return _latex_factor(part) + (f"^{{{part.power}}}" if part.power > 1 else "")
 
 
 def _latex_factor(part: Part) -> str:
@@ -74,10 +75,6 @@ def _latex_factor(part: Part) -> str:
         return rf"\tanh({argument})"
     known = part.function in ("sin", "cos", "exp", "log")
     return (rf"\{part.function}" if known else rf"\mathrm{{{part.function}}}") + f"({argument})"
-
-
-def _latex_power(part: Part) -> str:
-    return f"^{{{part.power}}}" if part.power > 1 else ""
 
 
 Sum: TypeAlias = Mapping[str, float] | Sequence[Group]  # terms, or an equation by process

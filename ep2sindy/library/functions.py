@@ -73,7 +73,8 @@ class Function:
         return f"{text}'" if self.is_slope else text
 
     def value(self, x: Any) -> Any:
-        argument = x if self._plain else self.scale * x + self.shift
+        is_bare = self.scale == 1.0 and self.shift == 0.0
+        argument = x if is_bare else self.scale * x + self.shift
         if self.kind.own and not is_numpy_array(argument):
             return self._bridged(argument)
         return (self.kind.slope if self.is_slope else self.kind.value)(argument)
@@ -142,10 +143,6 @@ class Function:
         above = f"{argument} > {number_text(low)}" if np.isfinite(low) else ""
         below = f"{argument} < {number_text(high)}" if np.isfinite(high) else ""
         return " and ".join(filter(None, [above, below])) or "finite values"
-
-    @property
-    def _plain(self) -> bool:
-        return self.scale == 1.0 and self.shift == 0.0
 
     def _bridged(self, argument: Any) -> Any:
         """Apply a user's NumPy function to a torch tensor; its slope provides the gradient."""

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy.interpolate import make_interp_spline
 
 from ep2sindy.data.gaps import between_gaps
@@ -259,14 +260,12 @@ def _gain(signal: Signal, t: np.ndarray, u: np.ndarray) -> float:
     if not (np.isfinite(beside).all() and np.ptp(beside) > 0.0):
         return 0.0
     beside = (beside - beside.mean()) / beside.std()
-    ends = range(N_LAGS + 1)
-    past = np.column_stack(
-        [np.ones(len(x) - N_LAGS), *(x[k : len(x) - N_LAGS + k] for k in ends[:-1])]
-    )
-    both = [w[k : len(x) - N_LAGS + k] for w in (beside, beside**2) for k in ends]
+    windows = [sliding_window_view(w, N_LAGS + 1) for w in (x, beside, beside**2)]
+    past, after = windows[0][:, :-1], windows[0][:, -1]
+    past = np.column_stack([np.ones(len(past)), past])
     left = [
-        float(np.square(x[N_LAGS:] - rows @ np.linalg.lstsq(rows, x[N_LAGS:], rcond=None)[0]).sum())
-        for rows in (past, np.column_stack([past, *both]))
+        float(np.square(after - rows @ np.linalg.lstsq(rows, after, rcond=None)[0]).sum())
+        for rows in (past, np.column_stack([past, *windows[1:]]))
     ]
     return 1.0 - left[1] / left[0] if left[0] > 0.0 else 0.0
 

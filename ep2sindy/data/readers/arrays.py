@@ -55,7 +55,7 @@ def read_hdf5(path: Path) -> FileSource:
     """
     import h5py
 
-    beside = _beside(path)
+    names, beside = names_in_hdf5(path)
 
     def read(name: str) -> xr.DataArray:
         if name in beside:
@@ -67,47 +67,48 @@ def read_hdf5(path: Path) -> FileSource:
         unit = attrs.pop("units")
         return unpack(array, attrs).assign_attrs(units=unit)
 
-    names = names_in_hdf5(path)
-    beside = {name: array for name, array in beside.items() if name not in names}
     with h5py.File(path) as file:
         attributes = {key: _plain(value) for key, value in file.attrs.items()}
     numbers = {key: value for key, value in attributes.items() if isinstance(value, int | float)}
     return FileSource(path, [*names, *beside], read, attributes=numbers)
 
 
-def _beside(path: Path) -> dict[str, xr.DataArray]:
-    """Times and steps in the attributes of groups, and the grids of openPMD's meshes."""
+def names_in_hdf5(path: Path) -> tuple[list[str], dict[str, xr.DataArray]]:
+    """Paths of all data sets, and what else the file holds as arrays by other names.
+
+    These are times and steps in the attributes of groups, and the grids of openPMD's meshes.
+    """
     import h5py
 
-    found: dict[str, xr.DataArray] = {}
+    names: list[str] = []
+    beside: dict[str, xr.DataArray] = {}
 
     def look(name: str, item: h5py.Group | h5py.Dataset) -> None:
         where = f"{name}/" if name else ""
-        if isinstance(item, h5py.Group):
+        if isinstance(item, h5py.Dataset):
+            names.append(name)
+        elif isinstance(item, h5py.Group):
             unit_s = _plain(item.attrs.get("timeUnitSI"))
             unit = "s" if unit_s == 1.0 else f"{unit_s:.15g} s" if isinstance(unit_s, float) else ""
             for key in {*TIMES} & {*item.attrs}:
                 if isinstance(value := _plain(item.attrs[key]), int | float):
-                    found[where + key] = xr.DataArray(float(value), attrs={"units": unit})
+                    beside[where + key] = xr.DataArray(float(value), attrs={"units": unit})
         if {*MESH} <= {*item.attrs}:
-            found.update(_mesh(name, item))
+            one = item if isinstance(item, h5py.Dataset) else next(iter(item.values()), None)
+            beside.update(_mesh(name, item, one) if isinstance(one, h5py.Dataset) else {})
 
     with h5py.File(path) as file:
         look("", file)
         file.visititems(look)
-    return found
+    return names, {name: array for name, array in beside.items() if name not in names}
 
 
-def _mesh(name: str, item: h5py.Group | h5py.Dataset) -> dict[str, xr.DataArray]:
+def _mesh(name: str, item: h5py.Group | h5py.Dataset, one: h5py.Dataset) -> dict[str, xr.DataArray]:
     """Coordinates of a mesh of openPMD in m, called as its axes, next to the mesh.
 
+    one: the mesh, or one of its components.
     Source: openPMD standard 1.1.0, mesh based records.
     """
-    import h5py
-
-    one = item if isinstance(item, h5py.Dataset) else next(iter(item.values()), None)
-    if not isinstance(one, h5py.Dataset):
-        return {}
     labels = [_plain(label) for label in item.attrs["axisLabels"]]
     unit_m = float(_plain(item.attrs.get("gridUnitSI", 1.0)))
     within = np.ravel(one.attrs.get("position", np.zeros(len(labels))))
@@ -133,18 +134,6 @@ def _openpmd_unit(attributes: h5py.AttributeManager) -> str:
     powers = dict(zip(SI, np.ravel(attributes.get("unitDimension", [])), strict=False))
     base = " ".join(f"{unit}^{power:g}" for unit, power in powers.items() if power)
     return f"{float(_plain(attributes['unitSI'])):.15g} {base}" if base else ""
-
-
-def names_in_hdf5(path: Path) -> list[str]:
-    """Paths of all data sets."""
-    import h5py
-
-    names: list[str] = []
-    with h5py.File(path) as file:
-        file.visititems(
-            lambda name, item: names.append(name) if isinstance(item, h5py.Dataset) else None
-        )
-    return names
 
 
 class _Stored(BackendArray):
@@ -326,7 +315,7 @@ def _read_v73(path: Path) -> FileSource:
                 )
             return stored_array(path, found).T
 
-    names = [name for name in names_in_hdf5(path) if not name.startswith("#refs#")]
+    names = [name for name in names_in_hdf5(path)[0] if not name.startswith("#refs#")]
     return FileSource(path, [name.replace("/", ".") for name in names], read)
 
 
