@@ -13,8 +13,8 @@ import numba
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, _CacheLocator
 from numba.core.compiler import Compiler
 
+from ep2sindy.runtime.files import cache_folder
 from ep2sindy.runtime.screen import say_once
-from ep2sindy.runtime.user_cache import cache_folder
 from ep2sindy.trust.user_code import PACKAGE
 
 THIS = Path(__file__)

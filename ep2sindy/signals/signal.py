@@ -324,7 +324,11 @@ def average_alike(
     if any(run.missing is not None for run in runs):
         return list(runs), ()
     factor = min(map(count_spare, runs)) if decimate == "auto" else int(decimate or 1)
-    return _in_means(runs, factor)
+    if factor < 2:
+        return list(runs), ()
+    fewer = [_means(run, factor) for run in runs]
+    n_left = sum(run.n_samples for run in fewer)
+    return fewer, (f"means over {factor} samples: {n_left} are left",)
 
 
 def average_long(
@@ -335,14 +339,14 @@ def average_long(
     Records are long if they hold over twenty thousand samples together. Means may take a millionth
     of the power of a state that stands out of the noise, and no more.
     """
-    if decimate != "auto":
+    if decimate != "auto" or any(run.missing is not None for run in runs):
         return average_alike(runs, decimate)
-    if sum(run.n_samples for run in runs) <= LONG or any(r.missing is not None for r in runs):
+    if sum(run.n_samples for run in runs) <= LONG:
         return list(runs), ()
     factor = min(map(count_spare, runs))
     while factor > 1 and max(_lost(run, factor) for run in runs) > LOST:
         factor = 3 * factor // 4
-    fewer, words = _in_means(runs, factor)
+    fewer, words = average_alike(runs, factor)
     return fewer, tuple(f"{each}; decimate=None takes all samples" for each in words)
 
 
@@ -371,14 +375,6 @@ def _samples_in_period(t: Samples, x: Samples) -> float:
 def _lost(run: Trajectory, factor: int) -> float:
     """Largest fraction of a state's power that means over so many samples take from it."""
     return max(lost_in_means(run.t, x, width_s=factor * run.dt_s) for x in run.states.T)
-
-
-def _in_means(runs: Sequence[Trajectory], factor: int) -> tuple[list[Trajectory], tuple[str, ...]]:
-    if factor < 2:
-        return list(runs), ()
-    fewer = [_means(run, factor) for run in runs]
-    n_left = sum(run.n_samples for run in fewer)
-    return fewer, (f"means over {factor} samples: {n_left} are left",)
 
 
 def _means(run: Trajectory, factor: int) -> Trajectory:
