@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 # above the second a square overflows. Terms that overflow raise their own error.
 LEAST, MOST = 1e-50, 1e150
 
+Points = Float[np.ndarray, " points"]
+
 # Times the noise, and fraction of the RMS, by which a state that is nonnegative may lie below zero.
 BELOW_NOISE, BELOW_ZERO = 6.0, 0.05
 
@@ -189,11 +191,7 @@ def least_squares(
 
 
 def least_beside_grid(
-    function: Callable[[float], float],
-    grid: Float[np.ndarray, " points"],
-    on_grid: Float[np.ndarray, " points"],
-    *,
-    tolerance: float,
+    function: Callable[[float], float], grid: Points, on_grid: Points, *, tolerance: float
 ) -> float:
     """Where a function that may be flat or have several minima is least.
 

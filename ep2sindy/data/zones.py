@@ -125,6 +125,7 @@ def zone_average(
 
 
 Factors = list[tuple[str, int]]
+Masks = Mapping[str, Bool[np.ndarray, "1 _ _"]]  # variable -> cells without plasma
 
 # Attribute: the product whose average over a cell's face, towards the anode, the variable holds.
 FACES = "face_average_of"
@@ -159,11 +160,7 @@ def _check_names(field: xr.Dataset, used: Sequence[str], columns: Sequence[str])
 
 
 def _zone_weights(
-    field: xr.Dataset,
-    slices: Mapping[str, slice],
-    masks: Mapping[str, Bool[np.ndarray, "1 _ _"]],
-    *,
-    axisymmetric: bool,
+    field: xr.Dataset, slices: Mapping[str, slice], masks: Masks, *, axisymmetric: bool
 ) -> Float[np.ndarray, "z r"]:
     """Cell sizes inside the zone, normalised to sum one; zero where any variable is masked."""
     sizes = [
@@ -185,10 +182,7 @@ def _zone_weights(
 
 
 def _means(
-    part: xr.Dataset,
-    masks: Mapping[str, Bool[np.ndarray, "1 _ _"]],
-    weights: Float[np.ndarray, "z r"],
-    columns: Sequence[Factors],
+    part: xr.Dataset, masks: Masks, weights: Float[np.ndarray, "z r"], columns: Sequence[Factors]
 ) -> Float[np.ndarray, "samples columns"]:
     """Weighted means of products of variables over the cells at all times, block by block."""
     means = np.zeros((part.sizes["time"], len(columns)))
@@ -446,9 +440,8 @@ def side_by_side(zones: Mapping[str, Zone | Sequence[float]], field: xr.Dataset)
         if not re.fullmatch(r"\w{1,100}", str(name)):
             raise ValueError(f"a zone's name must be a word, such as 'exit', got {name!r}")
         zone = resolve_zone(given if isinstance(given, Zone) else Zone(z=given), field)
-        is_part = isinstance(zone.z, tuple)
-        begin_m, end_m = zone.z if isinstance(zone.z, tuple) else (-math.inf, math.inf)
-        if begin_m < reached_m or not is_part:
+        begin_m, end_m = zone.z if isinstance(zone.z, tuple) else (math.nan, math.nan)
+        if not begin_m >= reached_m:
             raise ValueError(
                 "zones must follow each other in z without overlap, each with its ends in m: "
                 f"{name} is {zone.z}"

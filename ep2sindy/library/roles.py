@@ -322,15 +322,11 @@ class Roles:
     def _played(self, role: Role, library: NamedTerms) -> Iterator[Process]:
         """The processes by which a role may be played."""
         giver, taker, how = role
-        if not giver:
-            names = ["1"] if how == FREE else [library.names[library.index(term)] for term in how]
-            yield from (self._process(role, term) for term in names)
-            return
-        terms = [name for name in library.names if name != "1"] if how == FREE else how
-        terms = [library.names[library.index(term)] for term in terms]
+        free = [name for name in library.names if name != "1"] if giver else ["1"]
+        terms = free if how == FREE else [library.names[library.index(term)] for term in how]
         if how == FREE and not taker:
             terms = [term for term in terms if set(factors_of(term)) == set(_bodies(giver))]
-        if not self.nonnegative:
+        if not (giver and self.nonnegative):
             yield from (self._process(role, term) for term in terms)
             return
         if how != FREE and (wrong := [term for term in terms if not _holds(term, giver)]):

@@ -9,7 +9,7 @@ import os
 import pickle
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
@@ -22,7 +22,7 @@ import cloudpickle
 from joblib import Parallel, delayed, effective_n_jobs, parallel_config
 from joblib.parallel import BACKENDS, get_active_backend
 
-from ep2sindy.runtime.progress import SILENT, Progress
+from ep2sindy.runtime.progress import SILENT, Progress, Stage
 from ep2sindy.runtime.screen import SAID
 from ep2sindy.runtime.threads import one_thread
 from ep2sindy.runtime.values import check_positive
@@ -86,7 +86,7 @@ def collect(
     workers: Workers,
     function: Function,
     pieces: Sequence[Any],
-    stage: AbstractContextManager[Callable[[int], None]],
+    stage: Stage,
     *,
     size: Callable[[Any], int] = lambda piece: 1,
     tell: Callable[[int, Any], None] = lambda number, result: None,

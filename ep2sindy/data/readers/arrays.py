@@ -6,6 +6,7 @@ Values are read when they are used, except those of old MATLAB files and of JSON
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from importlib.util import find_spec
 from math import ceil, prod
 from pathlib import Path
@@ -417,11 +418,10 @@ def _split_frames(content: Any) -> tuple[Sequence[Mapping[str, Any]], Any]:
 
 def _is_column(value: Any) -> bool:
     """True for a list, or nested lists, of at least two numbers."""
-    try:
+    with suppress(TypeError, ValueError):
         array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        return False
-    return array.ndim > 0 and array.size > 1
+        return array.ndim > 0 and array.size > 1
+    return False
 
 
 def _units(names: Sequence[str]) -> dict[str, str]:
@@ -432,11 +432,10 @@ def _units(names: Sequence[str]) -> dict[str, str]:
 
 def _channel_m(content: Mapping[str, Any]) -> float | None:
     """Length of the channel in m, from the input that newer versions store with the output."""
-    try:
+    with suppress(KeyError, TypeError):
         node = content["input"]["config"]["thruster"]["geometry"]["channel_length"]
-    except (KeyError, TypeError):
-        return None
-    return float(node) if isinstance(node, int | float) else None
+        return float(node) if isinstance(node, int | float) else None
+    return None
 
 
 HALLTHRUSTER = Reader("HallThruster.jl", read_hallthruster, form="other", endings=(".json",))
