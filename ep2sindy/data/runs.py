@@ -32,11 +32,7 @@ TIMES = ("time", "t", "time_s", "t_s")  # accepted names of a table's time colum
 
 
 def trajectories_of(
-    runs: object,
-    *,
-    t: object = None,
-    inputs: Sequence[str] = (),
-    partial: bool = False,
+    runs: object, *, t: object = None, inputs: Sequence[str] = (), partial: bool = False
 ) -> list[Trajectory]:
     """Convert one run, or a list or a dict of runs, to trajectories.
 

@@ -208,11 +208,7 @@ def variable_factor(name: str) -> Function:
 
 
 def register_function(
-    name: str,
-    value: Values,
-    derivative: Values,
-    *,
-    domain: Interval = (-np.inf, np.inf),
+    name: str, value: Values, derivative: Values, *, domain: Interval = (-np.inf, np.inf)
 ) -> None:
     """Register a function of your own, so that terms can use it: `tanh(x)` or `tanh(2*x)`.
 

@@ -41,11 +41,7 @@ class SeparateArrays(Compiler):
 SEPARATE_ARRAYS: dict[str, Any] = {"pipeline_class": SeparateArrays}
 
 # How kernels are compiled that are nothing but loops over separate arrays that they are given.
-LOOPS: dict[str, Any] = {
-    "fastmath": {"contract"},
-    "error_model": "numpy",
-    **SEPARATE_ARRAYS,
-}
+LOOPS: dict[str, Any] = {"fastmath": {"contract"}, "error_model": "numpy", **SEPARATE_ARRAYS}
 
 # The same for kernels that only kernels call, from several places: they are compiled once and then
 # inlined. Where there is one place, `inline="always"` is faster to compile.

@@ -86,9 +86,7 @@ def layout_of(lines: Sequence[str]) -> Layout:
     return Layout(separator, decimal, first, columns, header, has_marks)
 
 
-def _form(
-    lines: Sequence[str],
-) -> tuple[str | None, str, tuple[int, ...], list[list[str]]]:
+def _form(lines: Sequence[str]) -> tuple[str | None, str, tuple[int, ...], list[list[str]]]:
     """Separator, decimal sign, numeric columns, and the cells of all lines.
 
     Separator and decimal sign are those by which most cells are numbers, in most columns.
