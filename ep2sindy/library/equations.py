@@ -16,7 +16,8 @@ from ep2sindy.library.roles import Group
 if TYPE_CHECKING:
     import sympy
 
-NOTHING: Mapping[str, float] = MappingProxyType({})
+Reach: TypeAlias = Mapping[str, float]  # term -> half-width of the interval of its coefficient
+NOTHING: Reach = MappingProxyType({})
 
 
 def latex_name(variable: str) -> str:
@@ -85,9 +86,7 @@ def equation_text(state: str, terms: Sum, *, digits: int = 3) -> str:
     return f"{state}' = {' '.join(equation_parts(terms, digits=digits)) or '0'}"
 
 
-def equation_parts(
-    terms: Sum, *, digits: int = 3, reach: Mapping[str, float] = NOTHING
-) -> list[str]:
+def equation_parts(terms: Sum, *, digits: int = 3, reach: Reach = NOTHING) -> list[str]:
     """Terms of an equation as texts such as `+ 5.48e-14 n_i n_n`.
 
     terms: or groups of them, which become `+ n_i n_n (1.6e-32 n_i + 3.1e-33 n_n)`. reach:
@@ -110,9 +109,7 @@ class Notation:
     first_gap: str
 
 
-def _parts_in(
-    notation: Notation, terms: Sum, digits: int, reach: Mapping[str, float] = NOTHING
-) -> list[str]:
+def _parts_in(notation: Notation, terms: Sum, digits: int, reach: Reach = NOTHING) -> list[str]:
     """Every term, or group of terms, with its sign."""
     if not isinstance(terms, Mapping):
         return [_group_in(notation, group, digits, first=k == 0) for k, group in enumerate(terms)]
@@ -181,7 +178,7 @@ def equations_latex(equations: Mapping[str, Sum], *, digits: int = 3) -> str:
     return "\\begin{aligned}\n" + " \\\\\n".join(lines) + "\n\\end{aligned}"
 
 
-def equation_html(state: str, terms: Sum, *, reach: Mapping[str, float] = NOTHING) -> str:
+def equation_html(state: str, terms: Sum, *, reach: Reach = NOTHING) -> str:
     """HTML of one equation, with sub- and superscripts, to three digits.
 
     terms: or groups of them. reach: half-width of the confidence interval by term name.

@@ -24,6 +24,9 @@ from ep2sindy.runtime.values import check_list
 
 KNOWN, FREE, EITHER = "known", "free", "known or free"
 
+Equations = Mapping[str, Mapping[str, float]]  # state -> term -> number
+Processes = Sequence[Process]
+
 
 class Role(NamedTuple):
     """What moves from one state to another; "" is the outside.
@@ -414,7 +417,7 @@ def _carriers(state: str, others: Sequence[str]) -> list[str]:
     return [state, *(product_of(Counter([state, other])) for other in others)]
 
 
-def sum_known(processes: Sequence[Process]) -> dict[Place, float]:
+def sum_known(processes: Processes) -> dict[Place, float]:
     """What processes with known coefficients add to the coefficients of a model, in SI."""
     found: dict[Place, float] = {}
     for process in processes:
@@ -424,10 +427,7 @@ def sum_known(processes: Sequence[Process]) -> dict[Place, float]:
 
 
 def constraint_of(
-    library: NamedTerms,
-    states: Sequence[str],
-    processes: Sequence[Process],
-    known: Sequence[Process] = (),
+    library: NamedTerms, states: Sequence[str], processes: Processes, known: Processes = ()
 ) -> Constraint | None:
     """The exact constraint of a model with these processes, and those with known coefficients.
 
@@ -456,9 +456,7 @@ def process_matrix(held: Constraint) -> Float[np.ndarray, "free processes"]:
     return np.array([[p.factors.get(at, 0.0) for p in held.processes] for at in places])
 
 
-def process_amounts(
-    held: Constraint, terms: Mapping[str, Mapping[str, float]]
-) -> list[tuple[Process, float]]:
+def process_amounts(held: Constraint, terms: Equations) -> list[tuple[Process, float]]:
     """Every process with its coefficient, those to be found first; terms of a model by state."""
     known = sum_known(held.known)
     places = [held.coefficients[k] for k in held.free]
@@ -499,7 +497,6 @@ class Group:
     reach: Mapping[str, float] = field(default_factory=dict)
 
 
-Equations = Mapping[str, Mapping[str, float]]  # state -> term -> number
 Part = tuple[str, float, float, float]  # a process in an equation: term, factor, amount, half-width
 
 

@@ -304,10 +304,10 @@ LONG = 20_000
 # record. At a hundred samples to a period they take 3e-8 of a sine, and 2e-6 of its third harmonic.
 LOST = 1e-6
 
+Averaged = tuple[list[Trajectory], tuple[str, ...]]  # runs, and what was done, in words
 
-def average_alike(
-    runs: Sequence[Trajectory], decimate: int | str | None
-) -> tuple[list[Trajectory], tuple[str, ...]]:
+
+def average_alike(runs: Sequence[Trajectory], decimate: int | str | None) -> Averaged:
     """Runs with their samples replaced by means over neighbours, and what was done, in words.
 
     decimate: number of samples that a mean is over; "auto" leaves a hundred to a period of the
@@ -331,9 +331,7 @@ def average_alike(
     return fewer, (f"means over {factor} samples: {n_left} are left",)
 
 
-def average_long(
-    runs: Sequence[Trajectory], decimate: int | str | None
-) -> tuple[list[Trajectory], tuple[str, ...]]:
+def average_long(runs: Sequence[Trajectory], decimate: int | str | None) -> Averaged:
     """`average_alike`; "auto" leaves short records, and keeps what is fast next to the period.
 
     Records are long if they hold over twenty thousand samples together. Means may take a millionth

@@ -32,6 +32,7 @@ DECAYED = 0.1  # a run has decayed if its late spread is below this fraction of 
 States = Float[np.ndarray, "samples n_states"]
 ByState = Float[np.ndarray, " n_states"]
 Bins = Float[np.ndarray, " bins"]
+ByRecord = float | Sequence[float]  # of one record, or of several
 
 
 def is_uniform(t: Samples) -> bool:
@@ -86,16 +87,12 @@ def dominant_frequency(t: Samples, x: Samples) -> float:
     return peak(*power_spectrum(t, x))
 
 
-def steps_in(
-    periods: float, *, frequency_Hz: float | Sequence[float], dt_s: float | Sequence[float]
-) -> float:
+def steps_in(periods: float, *, frequency_Hz: ByRecord, dt_s: ByRecord) -> float:
     """Number of time steps in the given number of periods, not rounded; median over records."""
     return float(np.median(periods / (np.asarray(frequency_Hz) * np.asarray(dt_s))))
 
 
-def samples_in_periods(
-    periods: float, *, frequency_Hz: float | Sequence[float], dt_s: float | Sequence[float]
-) -> int:
+def samples_in_periods(periods: float, *, frequency_Hz: ByRecord, dt_s: ByRecord) -> int:
     """Number of samples in the given number of periods, both ends included; median over records."""
     return round(steps_in(periods, frequency_Hz=frequency_Hz, dt_s=dt_s)) + 1
 
