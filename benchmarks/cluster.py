@@ -20,7 +20,7 @@ from threadpoolctl import threadpool_limits
 from benchmarks.pointwise import BLOCK_POINTS, study, write_grid
 from ep2sindy.data.open import read_field
 from ep2sindy.discovery.pointwise import blocks_of
-from ep2sindy.runtime.clusters import Dask
+from ep2sindy.runtime.parallel import Dask
 
 GRIDS, N_SAMPLES, N_WORKERS = ((41, 49), (100, 100)), 1201, 2
 

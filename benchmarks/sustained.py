@@ -26,7 +26,7 @@ from scipy.integrate import solve_ivp
 
 import ep2sindy as ep
 from benchmarks.source import measured_sets, named_set
-from ep2sindy.data.sampling import ZoneAverage, side_by_side
+from ep2sindy.data.zones import ZoneAverage, side_by_side
 from ep2sindy.library.relations import Constraint
 from ep2sindy.regression.searches import Search
 from ep2sindy.studies.processes import ComparedProcess, Zones, compared_processes, fit_roles

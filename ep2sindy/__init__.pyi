@@ -7,7 +7,7 @@ from ep2sindy.data.open import open_field as open_field  # for configs
 from ep2sindy.data.open import inspect_file as inspect_file
 from ep2sindy.data.run_files import read_runs as read_runs
 from ep2sindy.data.zones import zone_average as zone_average
-from ep2sindy.data.sampling import zone_averages as zone_averages
+from ep2sindy.data.zones import zone_averages as zone_averages
 from ep2sindy.data.zones import Zone as Zone  # for configs
 
 # Libraries

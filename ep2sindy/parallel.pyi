@@ -1,5 +1,5 @@
 # Parallel work
 from ep2sindy.runtime.parallel import Serial as Serial  # for configs
 from ep2sindy.runtime.parallel import Loky as Loky  # for configs
-from ep2sindy.runtime.clusters import Dask as Dask  # for configs
-from ep2sindy.runtime.clusters import Ray as Ray  # for configs
+from ep2sindy.runtime.parallel import Dask as Dask  # for configs
+from ep2sindy.runtime.parallel import Ray as Ray  # for configs

@@ -7,7 +7,7 @@ import pytest
 
 import ep2sindy as ep
 from ep2sindy.discovery.method import of_means
-from ep2sindy.signals.averaging import average_alike, average_long
+from ep2sindy.signals.signal import average_alike, average_long
 
 PER_PERIOD = 1450
 

@@ -10,7 +10,7 @@ import xarray as xr
 import ep2sindy as ep
 from ep2sindy.data import blocks
 from ep2sindy.data.blocks import blocks_of, read_whole
-from ep2sindy.data.readers import hdf5
+from ep2sindy.data.readers import arrays
 from ep2sindy.trust import memory
 
 SHAPE = (30, 8, 6)
@@ -21,7 +21,7 @@ SLABS, PENCILS = (5, 8, 6), (30, 2, 3)
 @pytest.fixture(autouse=True)
 def few_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Everything is large: it is read when it is used, in blocks of 240 values."""
-    for module in (blocks, hdf5, ep.data.readers.source):
+    for module in (blocks, arrays, ep.data.readers.source):
         monkeypatch.setattr(module, "AT_ONCE", 0)
     monkeypatch.setattr(blocks, "BLOCK_VALUES", 240)
 
@@ -86,14 +86,14 @@ def test_ranges_and_averages_in_blocks_are_those_of_the_whole(
 def test_each_chunk_is_read_once_and_no_more_than_a_block_at_a_time(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, chunks: tuple[int, ...]
 ) -> None:
-    path, sizes, read = written(tmp_path / "a.h5", chunks), [], hdf5._Stored._read
+    path, sizes, read = written(tmp_path / "a.h5", chunks), [], arrays._Stored._read
 
-    def counted(stored: hdf5._Stored, key: tuple[object, ...]) -> np.ndarray:
+    def counted(stored: arrays._Stored, key: tuple[object, ...]) -> np.ndarray:
         values = read(stored, key)
         sizes.append(values.size if stored.name == "/n_i" else 0)
         return values
 
-    monkeypatch.setattr(hdf5._Stored, "_read", counted)
+    monkeypatch.setattr(arrays._Stored, "_read", counted)
     ep.inspect_file(path)
     assert max(sizes) <= 240
     assert sum(sizes) == np.prod(SHAPE)

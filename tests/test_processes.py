@@ -9,8 +9,7 @@ import pytest
 
 import ep2sindy as ep
 from ep2sindy.library.equations import equation_html, equation_text, terms_latex
-from ep2sindy.library.processes import groups_of
-from ep2sindy.library.roles import constraint_of
+from ep2sindy.library.roles import constraint_of, groups_of
 from ep2sindy.report.document import Equation
 from ep2sindy.report.page import equation_mathml
 

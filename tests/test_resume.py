@@ -10,9 +10,9 @@ import pytest
 from omegaconf import DictConfig
 
 import ep2sindy as ep
+from ep2sindy.runtime.files import cache_folder
 from ep2sindy.runtime.kept_pieces import CachedWorkers, KeptPieces, PartDone
 from ep2sindy.runtime.parallel import Loky, Serial
-from ep2sindy.runtime.user_cache import cache_folder
 from ep2sindy.studies import benchmark, trace
 from tests.programs import Computed, composed, computed
 from tests.test_experiment_benchmark import TOYS

@@ -7,7 +7,7 @@ import pytest
 import xarray as xr
 
 import ep2sindy as ep
-from ep2sindy.data.sampling import ZoneAverage, side_by_side
+from ep2sindy.data.zones import ZoneAverage, side_by_side
 from ep2sindy.library.equations import equation_html, latex_derivative, latex_term_name
 from ep2sindy.library.names import check_state
 from ep2sindy.library.relations import parse_relation

@@ -19,10 +19,10 @@ import ep2sindy as ep
 from ep2sindy.model.many import WindowSteps, run_many
 from ep2sindy.model.vector_field import VectorField
 from ep2sindy.runtime.compilation import ANNOUNCEMENT, UNKEPT, digest, not_kept, sources
+from ep2sindy.runtime.files import cache_folder
 from ep2sindy.runtime.parallel import Loky, collect
 from ep2sindy.runtime.progress import Bars
 from ep2sindy.runtime.screen import say, say_once
-from ep2sindy.runtime.user_cache import cache_folder
 
 ABOUT = """Compiles all kernels of the package, once after installation: a minute on two cores.
 Runs of the command line do so by themselves; in Python, a call compiles what it uses."""

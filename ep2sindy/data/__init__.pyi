@@ -2,7 +2,7 @@
 from ep2sindy.data.open import read_field as read_field  # for configs
 from ep2sindy.data.open import write_field as write_field
 from ep2sindy.data.mapping import Variable as Variable  # for configs
-from ep2sindy.data.sampling import ZoneAverage as ZoneAverage  # for configs
+from ep2sindy.data.zones import ZoneAverage as ZoneAverage  # for configs
 from ep2sindy.data.gaps import MissingSamples as MissingSamples
 
 # Preparation

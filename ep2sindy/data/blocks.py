@@ -55,6 +55,11 @@ def scale(array: xr.DataArray, *, factor: float, offset: float) -> xr.DataArray:
     """`array * factor + offset`; of a large array that its file holds, computed when it is used."""
     if array.nbytes <= AT_ONCE:
         return array * factor + offset
-    packed = array.drop_attrs().assign_attrs(scale_factor=factor, add_offset=offset)
-    unpacked = xr.decode_cf(xr.Dataset({"it": packed}), decode_coords=False, **UNDECODED)["it"]
-    return unpacked.drop_attrs().assign_attrs(array.attrs).rename(array.name)
+    packing = {"scale_factor": factor, "add_offset": offset}
+    return unpack(array, packing).assign_attrs(array.attrs).rename(array.name)
+
+
+def unpack(array: xr.DataArray, packing: Mapping[str, Any]) -> xr.DataArray:
+    """Numbers that attributes such as `scale_factor` packed, computed when they are used."""
+    packed = xr.Dataset({"it": array.drop_attrs().assign_attrs(packing)})
+    return xr.decode_cf(packed, decode_coords=False, **UNDECODED)["it"].drop_attrs()

@@ -16,14 +16,14 @@ from itertools import combinations
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ep2sindy.data.numbers import check_nonnegative
+from ep2sindy.data.numbers import check_nonnegative, noise_of
 from ep2sindy.data.runs import trajectories_of
 from ep2sindy.data.trajectory import Trajectory, check_agreement
 from ep2sindy.library.facts import Facts
 from ep2sindy.library.library import Library
 from ep2sindy.library.names import check_state
 from ep2sindy.library.relations import Relation, complete
-from ep2sindy.runtime.values import check_kind, check_list
+from ep2sindy.runtime.values import Columns, Samples, check_kind, check_list
 
 # Check that the functions of a library are defined along the trajectories.
 
@@ -56,9 +56,7 @@ def check_domain(runs: Sequence[Trajectory], library: Library, *, smooth: bool) 
             )
 
 
-def noise_inside(
-    library: Library, samples: Float[np.ndarray, "samples variables"]
-) -> Float[np.ndarray, "samples variables"]:
+def noise_inside(library: Library, samples: Columns) -> Columns:
     """The samples of a run; those that noise moved out of a function's domain lie in it again.
 
     They are as far from its end as the noise is large: nearer, samples tell no difference.
@@ -72,35 +70,23 @@ def noise_inside(
     return kept
 
 
-def _noise_std(x: Float[np.ndarray, " samples"]) -> float:
-    """Standard deviation of a signal's white noise, by its third differences, or zero.
-
-    They remove what is smooth, and have 20 times the variance; of a few outliers their median
-    knows nothing.
-    """
-    if len(x) < 4:
-        return 0.0
-    std = float(np.median(np.abs(np.diff(x, n=3)))) / (0.6745 * np.sqrt(20.0))
+def _noise_std(x: Samples) -> float:
+    """Standard deviation of a signal's white noise, by its third differences; zero for rounding."""
+    std = noise_of(x, 3)
     return std if std > NOISY * np.ptp(x) else 0.0
 
 
-def keep_inside(
-    library: Library,
-    moved: Float[np.ndarray, "samples variables"],
-    samples: Float[np.ndarray, "samples variables"],
-) -> Float[np.ndarray, "samples variables"]:
+def keep_inside(library: Library, moved: Columns, samples: Columns) -> Columns:
     """Return `moved`, with the samples put back where a function of the library is undefined.
 
     moved: modified samples, such as smoothed ones. A value that leaves a function's domain is
     replaced by the one in `samples`. Columns: first the library's variables, then any others.
     """
-    kept = moved
+    kept = moved.copy() if library.functions else moved
     for function in library.functions:
         v = library.variables.index(function.variable)
         wrong = function.misplaced(moved[:, v], samples[:, v])
-        if wrong.any():
-            kept = kept.copy() if kept is moved else kept
-            kept[wrong, v] = samples[wrong, v]
+        kept[wrong, v] = samples[wrong, v]
     return kept
 
 

@@ -107,9 +107,7 @@ def mask_cells(array: xr.DataArray) -> Bool[np.ndarray, "1 z r"]:
 
 
 def check_samples(
-    array: xr.DataArray,
-    values: Float[np.ndarray, "time z r"],
-    masked: Bool[np.ndarray, "1 z r"],
+    array: xr.DataArray, values: Float[np.ndarray, "time z r"], masked: Bool[np.ndarray, "1 z r"]
 ) -> None:
     """Raise ValueError unless each cell is finite at all times, or masked at all times.
 

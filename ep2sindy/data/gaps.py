@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ep2sindy.library.units import Clock
+from ep2sindy.runtime.values import Mask, Samples
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -65,12 +66,12 @@ def without_gaps(field: xr.Dataset) -> xr.Dataset:
     return field.isel(time=np.flatnonzero(present_rows(alone)))
 
 
-def usual_step(t: Float[np.ndarray, " samples"]) -> float:
+def usual_step(t: Samples) -> float:
     """Median step of times, in their unit, which gaps leave as it is."""
     return float(np.median(np.diff(t)))
 
 
-def between_gaps(t: Float[np.ndarray, " samples"]) -> list[tuple[int, int]]:
+def between_gaps(t: Samples) -> list[tuple[int, int]]:
     """First and last sample (exclusive) of every segment of times without a gap.
 
     A gap is a step that is long next to the median step, and next to a step next to it: times that
@@ -106,7 +107,7 @@ def describe_gaps(t: Float[np.ndarray, " kept"], n_samples: int, clock: Clock) -
     )
 
 
-def describe_breaks(t: Float[np.ndarray, " samples"], clock: Clock) -> str:
+def describe_breaks(t: Samples, clock: Clock) -> str:
     """Message with the number of gaps in the times of a record, and the longest; "" for none."""
     n_gaps, steps = len(between_gaps(t)) - 1, np.diff(t)
     if not n_gaps:
@@ -121,11 +122,7 @@ def describe_breaks(t: Float[np.ndarray, " samples"], clock: Clock) -> str:
     )
 
 
-def describe_missing(
-    t: Float[np.ndarray, " samples"],
-    absent: Mapping[str, Bool[np.ndarray, " samples"]],
-    clock: Clock,
-) -> str:
+def describe_missing(t: Samples, absent: Mapping[str, Mask], clock: Clock) -> str:
     """Message with the number of missing samples of every column, and its longest gap.
 
     t: times in s. absent: column -> true where it holds a NaN.

@@ -6,12 +6,14 @@ Values without a single clear meaning as real numbers are refused.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from math import comb
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float, Shaped
 
 from ep2sindy.library.units import calendar_unit
+from ep2sindy.runtime.values import Samples
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -19,6 +21,8 @@ if TYPE_CHECKING:
 # Below the first size a product of three variables, squared in a Gram matrix, underflows to zero;
 # above the second a square overflows. Terms that overflow raise their own error.
 LEAST, MOST = 1e-50, 1e150
+
+Points = Float[np.ndarray, " points"]
 
 # Times the noise, and fraction of the RMS, by which a state that is nonnegative may lie below zero.
 BELOW_NOISE, BELOW_ZERO = 6.0, 0.05
@@ -71,7 +75,7 @@ def count_dates(dates: pd.Series) -> tuple[Float[np.ndarray, " rows"], str]:
     return t, calendar_unit(float(np.nanmedian(steps)) if np.isfinite(steps).any() else 0.0)
 
 
-def even_grid(t: Shaped[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"]:
+def even_grid(t: Shaped[np.ndarray, " samples"]) -> Samples:
     """Convert times to float64; those that are even within rounding become exactly even.
 
     These are times of a shorter type, and times that repeat because they were written with few
@@ -94,7 +98,7 @@ def even_grid(t: Shaped[np.ndarray, " samples"]) -> Float[np.ndarray, " samples"
     return grid if is_rounded else times
 
 
-def digits_of_rounded(t: Float[np.ndarray, " samples"]) -> int | None:
+def digits_of_rounded(t: Samples) -> int | None:
     """Number of digits to which times of equal steps were rounded so that some repeat; or None.
 
     Each time must lie on the even grid within one unit of its last digit, and the steps must be
@@ -136,7 +140,7 @@ def without_marks(values: Float[np.ndarray, "*any"]) -> Float[np.ndarray, "*any"
     return values
 
 
-def rounding_s(t: Float[np.ndarray, " samples"]) -> float:
+def rounding_s(t: Samples) -> float:
     """Largest error of a time due to float64 rounding, in s; epoch seconds resolve 2e-7 s."""
     return 2.0 * float(np.spacing(np.abs(t).max()))
 
@@ -187,11 +191,7 @@ def least_squares(
 
 
 def least_beside_grid(
-    function: Callable[[float], float],
-    grid: Float[np.ndarray, " points"],
-    on_grid: Float[np.ndarray, " points"],
-    *,
-    tolerance: float,
+    function: Callable[[float], float], grid: Points, on_grid: Points, *, tolerance: float
 ) -> float:
     """Where a function that may be flat or have several minima is least.
 
@@ -238,13 +238,23 @@ def band_of(draws: Float[np.ndarray, "draws ..."], level: float) -> np.ndarray:
     return quantiles(draws, [0.5 - 0.5 * level, 0.5 + 0.5 * level])
 
 
-def check_nonnegative(name: str, runs: Sequence[Float[np.ndarray, " samples"]]) -> None:
+def noise_of(x: Samples, order: int) -> float:
+    """Standard deviation of white noise, by the median of differences of this order.
+
+    These remove what is smooth; a few outliers do not change their median. It is zero for samples
+    that have none.
+    """
+    if len(x) <= order:
+        return 0.0
+    # Differences of white noise have so many times its variance; 0.6745 is the normal quartile.
+    return float(np.median(np.abs(np.diff(x, order)))) / (0.6745 * np.sqrt(comb(2 * order, order)))
+
+
+def check_nonnegative(name: str, runs: Sequence[Samples]) -> None:
     """Raise ValueError for a state that is below zero by more than its noise; NaN is missing."""
     for values in runs:
         x = values[np.isfinite(values)]
-        # The second difference of white noise has six times its variance.
-        noise = np.median(np.abs(np.diff(x, 2))) / (0.6745 * np.sqrt(6.0))
-        allowed = max(BELOW_NOISE * noise, BELOW_ZERO * np.sqrt(np.square(x).mean()))
+        allowed = max(BELOW_NOISE * noise_of(x, 2), BELOW_ZERO * np.sqrt(np.square(x).mean()))
         if x.mean() < 0.0 or x.min() < -allowed:
             raise ValueError(
                 f"nonnegative roles need states that are concentrations or numbers: {name} is "

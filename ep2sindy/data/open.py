@@ -29,7 +29,7 @@ from ep2sindy.data.mapping import (
     read_axes,
 )
 from ep2sindy.data.quantities import STEP_DOUBT, DoubtfulUnit, conversion, to_si
-from ep2sindy.data.readers.netcdf import NETCDF
+from ep2sindy.data.readers.arrays import NETCDF
 from ep2sindy.data.readers.registry import reader_of
 from ep2sindy.data.readers.source import FileSource, damage_named, file_named
 from ep2sindy.data.recognition import recognise

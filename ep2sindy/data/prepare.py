@@ -10,6 +10,7 @@ from __future__ import annotations
 import ast
 import operator
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 
 import numpy as np
 import xarray as xr
@@ -380,12 +381,8 @@ def low_pass(field: xr.Dataset, *, cutoff_Hz: float, order: int = 4) -> xr.Datas
             f"{field.sizes['time']}; lower the order or leave it out"
         )
     sos = signal.butter(order, cutoff_Hz, fs=1 / dt_s, output="sos")
-    smooth = {}
-    for name in _of_time(field):
-        array = _samples(field, name)
-        values = signal.sosfiltfilt(sos, array.values, axis=0, padlen=n_edge)
-        smooth[name] = array.copy(data=values)
-    return field.assign(smooth)
+    smooth = partial(signal.sosfiltfilt, sos, axis=0, padlen=n_edge)
+    return _with_samples(field, _of_time(field), smooth)
 
 
 def _uniform_step(field: xr.Dataset) -> float:
@@ -563,13 +560,20 @@ def detrend(
     if not 1 <= degree < len(t):
         raise ValueError(f"degree must be 1 or more, below the number of samples, got {degree}")
     basis = np.linalg.qr(np.vander((t - t.mean()) / np.ptp(t), degree + 1, increasing=True))[0]
-    found = {}
-    for name in names:
-        array = _samples(field, name)
-        cells = array.values.reshape(len(t), -1)
-        flat = cells - basis @ (basis.T @ cells) + cells.mean(axis=0)
-        found[name] = array.copy(data=flat.reshape(array.shape))
-    return field.assign(found)
+
+    def flatten(values: np.ndarray) -> np.ndarray:
+        cells = values.reshape(len(t), -1)
+        return (cells - basis @ (basis.T @ cells) + cells.mean(axis=0)).reshape(values.shape)
+
+    return _with_samples(field, names, flatten)
+
+
+def _with_samples(
+    field: xr.Dataset, names: Sequence[str], change: Callable[[np.ndarray], np.ndarray]
+) -> xr.Dataset:
+    """The field with changed samples of some variables of time; see `_samples`."""
+    arrays = ((name, _samples(field, name)) for name in names)
+    return field.assign({name: array.copy(data=change(array.values)) for name, array in arrays})
 
 
 def _of_time(field: xr.Dataset) -> list[str]:

@@ -6,7 +6,6 @@ import re
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float
 
 from ep2sindy.data.numbers import without_marks
 from ep2sindy.data.readers.table_layout import split_name
@@ -20,6 +19,7 @@ from ep2sindy.library.units import (
     time_unit_in,
     unit_product,
 )
+from ep2sindy.runtime.values import Columns
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -207,9 +207,7 @@ def own_unit(ours: str, file_unit: str) -> str:
     return next((u for u in options if u and converts(ours, u, is_variable=True)), "1")
 
 
-def columns_in_si(
-    table: pd.DataFrame,
-) -> tuple[Float[np.ndarray, "rows states"], dict[str, str]]:
+def columns_in_si(table: pd.DataFrame) -> tuple[Columns, dict[str, str]]:
     """Samples of a table's columns by the units in their names, and state -> unit."""
     values = np.empty(table.shape)
     units: dict[str, str] = {}

@@ -287,10 +287,7 @@ class _Arrays:
     # Variables.
 
     def variables(
-        self,
-        axes: Mapping[str, Variable],
-        rest: Sequence[ArrayInfo],
-        lengths: Mapping[str, int],
+        self, axes: Mapping[str, Variable], rest: Sequence[ArrayInfo], lengths: Mapping[str, int]
     ) -> dict[str, Variable]:
         """Arrays that fit the axes in one way alone, under our names if theirs mean a quantity."""
         known = {

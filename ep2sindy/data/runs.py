@@ -9,14 +9,13 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import numpy as np
-from jaxtyping import Float
 
 from ep2sindy.data.gaps import MissingSamples, describe_gaps, describe_missing, present_rows
 from ep2sindy.data.numbers import count_dates, real_numbers, seconds
 from ep2sindy.data.quantities import axis_of, columns_in_si, time_unit
 from ep2sindy.data.trajectory import CLOCK, PARAMETER, ROLE, Trajectory
 from ep2sindy.library.units import SECONDS, Clock, seconds_in
-from ep2sindy.runtime.values import check_list, check_positive
+from ep2sindy.runtime.values import Columns, Samples, check_list, check_positive
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -33,11 +32,7 @@ TIMES = ("time", "t", "time_s", "t_s")  # accepted names of a table's time colum
 
 
 def trajectories_of(
-    runs: object,
-    *,
-    t: object = None,
-    inputs: Sequence[str] = (),
-    partial: bool = False,
+    runs: object, *, t: object = None, inputs: Sequence[str] = (), partial: bool = False
 ) -> list[Trajectory]:
     """Convert one run, or a list or a dict of runs, to trajectories.
 
@@ -235,8 +230,8 @@ def _from_table(table: pd.DataFrame, partial: bool) -> Trajectory:
 
 
 def _present(
-    t: Float[np.ndarray, " samples"],
-    values: Float[np.ndarray, "samples states"],
+    t: Samples,
+    values: Columns,
     states: Sequence[str],
     partial: bool,
     *,
@@ -259,7 +254,7 @@ def _present(
     return Trajectory(t[kept], values[kept], states, missing=missing, clock=clock, units=units)
 
 
-def _elapsed(column: pd.Series) -> tuple[Float[np.ndarray, " rows"], Clock]:
+def _elapsed(column: pd.Series) -> tuple[Samples, Clock]:
     """Times of a column in s, and their clock: the unit in its name; of dates, by their steps."""
     if column.dtype.kind in "mM":
         t, unit = count_dates(column)

@@ -9,6 +9,8 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from ep2sindy.runtime.values import Columns, Mask, Samples
+
 # Number of samples at an end of the range that cannot be chance. FEWEST holds if hardly any value
 # repeats. Rounded samples need more than TIMES the largest count among the NEXT nearest levels; at
 # the crest of a sine that ratio is 2.5.
@@ -30,8 +32,8 @@ class Bounds:
     is an exact value. words: one message per affected column. at: mask of the inexact samples.
     """
 
-    lower: Float[np.ndarray, "samples columns"]
-    upper: Float[np.ndarray, "samples columns"]
+    lower: Columns
+    upper: Columns
     words: tuple[str, ...]
 
     @cached_property
@@ -39,7 +41,7 @@ class Bounds:
         return self.lower < self.upper
 
 
-def bounds_of(values: Float[np.ndarray, "samples columns"], names: Sequence[str]) -> Bounds | None:
+def bounds_of(values: Columns, names: Sequence[str]) -> Bounds | None:
     """Find the limits of clipped samples, and of samples rounded more coarsely than their noise.
 
     A column is clipped if an end of its range occurs again and again while neighbouring values do
@@ -74,16 +76,12 @@ def bounds_of(values: Float[np.ndarray, "samples columns"], names: Sequence[str]
     return Bounds(lower, upper, tuple(words)) if words else None
 
 
-def _n_repeats(x: Float[np.ndarray, " samples"]) -> int:
+def _n_repeats(x: Samples) -> int:
     ordered = np.sort(x)
     return int(np.count_nonzero(ordered[1:] == ordered[:-1]))
 
 
-def _is_clipped(
-    x: Float[np.ndarray, " samples"],
-    there: Bool[np.ndarray, " samples"],
-    others: Int[np.ndarray, " levels"],
-) -> bool:
+def _is_clipped(x: Samples, there: Mask, others: Int[np.ndarray, " levels"]) -> bool:
     """True if an end of the range occurs too often. others: counts of other levels, nearest first.
 
     there: mask of the samples at that end.
@@ -99,7 +97,7 @@ def _is_clipped(
     return bool(counted.sum() > most)
 
 
-def _has_noise(x: Float[np.ndarray, " samples"]) -> bool:
+def _has_noise(x: Samples) -> bool:
     """True if more than half of consecutive third differences change sign.
 
     For white noise about three in four do; for a signal that the samples resolve hardly any do,
@@ -112,7 +110,7 @@ def _has_noise(x: Float[np.ndarray, " samples"]) -> bool:
     return bool(turns[both].sum() > 0.5 * both.sum())
 
 
-def _coarse_step(x: Float[np.ndarray, " samples"], levels: Float[np.ndarray, " levels"]) -> float:
+def _coarse_step(x: Samples, levels: Float[np.ndarray, " levels"]) -> float:
     """Step that samples are rounded to; 0 if they are not rounded, or more finely than noise."""
     if len(levels) < 3 or SAMPLES_PER_LEVEL * len(levels) > len(x):
         return 0.0

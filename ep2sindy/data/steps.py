@@ -30,6 +30,7 @@ NUMBER = re.compile(r"(\d+)")
 LEAST_UNNAMED = 3  # numbers without such a word; two may be kinds of particles
 
 Place = tuple[FileSource, str]
+Places = Mapping[str, Place]
 
 
 def open_record(path: str | Path | Sequence[str | Path]) -> FileSource:
@@ -181,10 +182,7 @@ def join_files(files: Sequence[str]) -> FileSource:
 
 
 def _joined(
-    first: FileSource,
-    steps: Mapping[int, Mapping[str, Place]],
-    shared: Mapping[str, Place],
-    kind: str,
+    first: FileSource, steps: Mapping[int, Places], shared: Places, kind: str
 ) -> FileSource:
     """Source of arrays joined over steps. first: gives all else. shared: arrays next to the steps.
 

@@ -22,7 +22,7 @@ from ep2sindy.data.numbers import check_magnitude, real_numbers, rounding_s, sec
 from ep2sindy.library.names import check_state, check_variable
 from ep2sindy.library.units import SECONDS, Clock
 from ep2sindy.runtime.screen import html_table, one_screen, text_table
-from ep2sindy.runtime.values import check_list, locked, read_only
+from ep2sindy.runtime.values import Columns, Mask, Samples, check_list, locked, read_only
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -161,7 +161,7 @@ class Trajectory:
         """
         if self.missing is None:
             return self
-        kept: Bool[np.ndarray, " samples"] = np.logical_not(self.missing.any(axis=1))
+        kept: Mask = np.logical_not(self.missing.any(axis=1))
         if kept.sum() < 2:
             raise ValueError(
                 f"two samples or more must hold all states: {self._lacking()}, and {kept.sum()} "
@@ -220,7 +220,7 @@ class Trajectory:
             )
         return self._at(slice(start, stop))
 
-    def _at(self, rows: slice | Bool[np.ndarray, " samples"]) -> Trajectory:
+    def _at(self, rows: slice | Mask) -> Trajectory:
         return replace(
             self,
             t=self.t[rows],
@@ -365,7 +365,7 @@ def _finite(parameters: Mapping[str, float]) -> dict[str, float]:
     return {name: float(value) for name, value in parameters.items()}
 
 
-def check_time(t: Float[np.ndarray, " samples"]) -> None:
+def check_time(t: Samples) -> None:
     """Raise ValueError unless t has two samples or more, is finite and increases."""
     if t.ndim != 1 or len(t) < 2:
         raise ValueError(f"a trajectory needs at least two samples: t has shape {t.shape}")
@@ -402,10 +402,16 @@ def check_agreement(trajectories: Sequence[Trajectory], variables: Sequence[str]
     for k, run in enumerate(trajectories):
         missing = [name for name in names if name not in run.names]
         if missing or run.state_names != first.state_names:
+            way = "give all of them the same states, named alike and in the same order"
+            if lacking := [name for name in missing if name not in first.state_names]:
+                way = (
+                    f"the library needs {lacking}: sample it as a state or pass it as an input, "
+                    "leave its terms out, or derive it (+exp=trace does, of one signal)"
+                )
             raise ValueError(
                 f"every trajectory needs the states {list(first.state_names)} and the variables "
                 f"{list(variables)}: trajectory {k} has states {list(run.state_names)} and inputs "
-                f"{list(run.input_names)}; {_way_to_agree(first, missing)}"
+                f"{list(run.input_names)}; {way}"
             )
         for name in (*names, *run.parameters):
             if run.units[name] != first.units.get(name, run.units[name]):
@@ -413,16 +419,6 @@ def check_agreement(trajectories: Sequence[Trajectory], variables: Sequence[str]
                     f"units must agree: {name!r} is in {first.units[name]} in trajectory 0 and "
                     f"in {run.units[name]} in trajectory {k}; convert one of them first"
                 )
-
-
-def _way_to_agree(first: Trajectory, missing: Sequence[str]) -> str:
-    """What to do about a trajectory that lacks variables, or whose states are others."""
-    if lacking := [name for name in missing if name not in first.state_names]:
-        return (
-            f"the library needs {lacking}: sample it as a state or pass it as an input, leave its "
-            "terms out, or derive it (+exp=trace does, of one signal)"
-        )
-    return "give all of them the same states, named alike and in the same order"
 
 
 def spread_blocks(runs: Sequence[Trajectory], *, most: int, block: int) -> list[Trajectory]:
@@ -454,11 +450,7 @@ CLOCK = "read_in"  # attribute of the time coordinate: the unit in which times a
 ROLE, PARAMETER = "role", "parameter"  # attribute of a scalar coordinate, and its value
 
 
-def as_dataframe(
-    t: Float[np.ndarray, " samples"],
-    values: Float[np.ndarray, "samples variables"],
-    names: Sequence[str],
-) -> pd.DataFrame:
+def as_dataframe(t: Samples, values: Columns, names: Sequence[str]) -> pd.DataFrame:
     """A column per variable, in SI, over an index `time_s`; `ep.discover` takes it as a run."""
     import pandas as pd  # takes time to import, and few ask for it
 
@@ -466,11 +458,7 @@ def as_dataframe(
 
 
 def as_dataset(
-    t: Float[np.ndarray, " samples"],
-    values: Float[np.ndarray, "samples variables"],
-    names: Sequence[str],
-    units: Mapping[str, str],
-    clock: Clock,
+    t: Samples, values: Columns, names: Sequence[str], units: Mapping[str, str], clock: Clock
 ) -> xr.Dataset:
     """A variable for each name over `time` in s, with units and the clock's as attributes."""
     import xarray as xr

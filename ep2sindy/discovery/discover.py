@@ -22,7 +22,7 @@ from ep2sindy.runtime.parallel import SURROUNDING, Workers, collect
 from ep2sindy.runtime.progress import SILENT, Progress, as_progress
 from ep2sindy.runtime.threads import one_thread
 from ep2sindy.runtime.values import check_count, check_kind
-from ep2sindy.signals.averaging import average_long
+from ep2sindy.signals.signal import average_long
 
 
 @one_thread()

@@ -11,12 +11,13 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, TypeAlias
 
 from ep2sindy.library.names import RECIPROCAL, Part, split_term
-from ep2sindy.library.processes import Group
+from ep2sindy.library.roles import Group
 
 if TYPE_CHECKING:
     import sympy
 
-NOTHING: Mapping[str, float] = MappingProxyType({})
+Reach: TypeAlias = Mapping[str, float]  # term -> half-width of the interval of its coefficient
+NOTHING: Reach = MappingProxyType({})
 
 
 def latex_name(variable: str) -> str:
@@ -54,18 +55,17 @@ def latex_term_name(name: str) -> str:
 
     Quotients become fractions: `x*sin(y)/z` -> `\frac{x \, \sin(y)}{z}`.
     """
-    above, below = _sides(name)
-    over, under = (
-        r" \, ".join(_latex_factor(p) + _latex_power(p) for p in side) for side in (above, below)
-    )
-    return rf"\frac{{{over or 1}}}{{{under}}}" if below else over or name
+    over, under = (r" \, ".join(map(_latex_part, side)) for side in _sides(name))
+    return rf"\frac{{{over or 1}}}{{{under}}}" if under else over or name
+
+
+def _latex_part(part: Part) -> str:
+    return _latex_factor(part) + (f"^{{{part.power}}}" if part.power > 1 else "")
 
 
 def _latex_factor(part: Part) -> str:
     argument = part.argument_of(latex_name(part.variable), times=r" \, ")
-    if not part.function:
-        return latex_name(part.variable)
-    if part.function == RECIPROCAL:
+    if part.function in ("", RECIPROCAL):
         return argument if part.is_bare else f"({argument})"
     if part.function == "sqrt":
         root = rf"\sqrt{{{argument}}}"
@@ -78,10 +78,6 @@ def _latex_factor(part: Part) -> str:
     return (rf"\{part.function}" if known else rf"\mathrm{{{part.function}}}") + f"({argument})"
 
 
-def _latex_power(part: Part) -> str:
-    return f"^{{{part.power}}}" if part.power > 1 else ""
-
-
 Sum: TypeAlias = Mapping[str, float] | Sequence[Group]  # terms, or an equation by process
 
 
@@ -90,9 +86,7 @@ def equation_text(state: str, terms: Sum, *, digits: int = 3) -> str:
     return f"{state}' = {' '.join(equation_parts(terms, digits=digits)) or '0'}"
 
 
-def equation_parts(
-    terms: Sum, *, digits: int = 3, reach: Mapping[str, float] = NOTHING
-) -> list[str]:
+def equation_parts(terms: Sum, *, digits: int = 3, reach: Reach = NOTHING) -> list[str]:
     """Terms of an equation as texts such as `+ 5.48e-14 n_i n_n`.
 
     terms: or groups of them, which become `+ n_i n_n (1.6e-32 n_i + 3.1e-33 n_n)`. reach:
@@ -115,9 +109,7 @@ class Notation:
     first_gap: str
 
 
-def _parts_in(
-    notation: Notation, terms: Sum, digits: int, reach: Mapping[str, float] = NOTHING
-) -> list[str]:
+def _parts_in(notation: Notation, terms: Sum, digits: int, reach: Reach = NOTHING) -> list[str]:
     """Every term, or group of terms, with its sign."""
     if not isinstance(terms, Mapping):
         return [_group_in(notation, group, digits, first=k == 0) for k, group in enumerate(terms)]
@@ -169,33 +161,29 @@ def _html_term(name: str, size: float, half_width: float | None, digits: int) ->
     return f"{_number_html(size, digits)}{error} {term}".strip()
 
 
-def sum_latex(terms: Sum, *, digits: int = 3) -> str:
-    r"""LaTeX of the right-hand side of an equation: `- 2.62 \cdot 10^{5} \, n_{i} + ...`."""
-    return " ".join(terms_latex(terms, digits=digits)) or "0"
-
-
 def terms_latex(terms: Sum, *, digits: int = 3) -> list[str]:
-    """LaTeX of every term, or group of terms, with its sign; a factor of one is not written."""
+    r"""LaTeX of every term, or group of terms, with its sign: `- 2.62 \cdot 10^{5} \, n_{i}`.
+
+    A factor of one is not written.
+    """
     return _parts_in(LATEX, terms, digits)
 
 
 def equations_latex(equations: Mapping[str, Sum], *, digits: int = 3) -> str:
     """LaTeX `aligned` block with one equation per line. equations: state -> terms."""
     lines = (
-        f"{latex_derivative(state)} &= {sum_latex(terms, digits=digits)}"
+        f"{latex_derivative(state)} &= {' '.join(terms_latex(terms, digits=digits)) or 0}"
         for state, terms in equations.items()
     )
     return "\\begin{aligned}\n" + " \\\\\n".join(lines) + "\n\\end{aligned}"
 
 
-def equation_html(
-    state: str, terms: Sum, *, digits: int = 3, reach: Mapping[str, float] = NOTHING
-) -> str:
-    """HTML of one equation, with sub- and superscripts.
+def equation_html(state: str, terms: Sum, *, reach: Reach = NOTHING) -> str:
+    """HTML of one equation, with sub- and superscripts, to three digits.
 
     terms: or groups of them. reach: half-width of the confidence interval by term name.
     """
-    right = " ".join(_parts_in(HTML, terms, digits, reach)) or "0"
+    right = " ".join(_parts_in(HTML, terms, 3, reach)) or "0"
     return f"d{_variable_html(state)}/dt = {right}".replace("-", "&minus;")
 
 
@@ -271,10 +259,8 @@ def _term_html(name: str) -> str:
 
 def _part_html(part: Part) -> str:
     argument = part.argument_of(_variable_html(part.variable), times=" ")
-    if part.function == RECIPROCAL:
-        text = argument if part.is_bare else f"({argument})"
-    else:
-        text = f"{html.escape(part.function)}({argument})" if part.function else argument
+    function = html.escape(part.function.removeprefix(RECIPROCAL))
+    text = f"{function}({argument})" if function or not part.is_bare else argument
     return text + (f"<sup>{part.power}</sup>" if part.power > 1 else "")
 
 

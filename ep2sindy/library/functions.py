@@ -14,10 +14,11 @@ from typing import Any
 
 import numpy as np
 from array_api_compat import array_namespace, is_numpy_array
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from ep2sindy.library.names import RECIPROCAL, Part, number_text
 from ep2sindy.library.units import unit_product
+from ep2sindy.runtime.values import Mask, Samples
 
 Values = Callable[[Any], Any]
 Interval = tuple[float, float]
@@ -72,7 +73,8 @@ class Function:
         return f"{text}'" if self.is_slope else text
 
     def value(self, x: Any) -> Any:
-        argument = x if self._plain else self.scale * x + self.shift
+        is_bare = self.scale == 1.0 and self.shift == 0.0
+        argument = x if is_bare else self.scale * x + self.shift
         if self.kind.own and not is_numpy_array(argument):
             return self._bridged(argument)
         return (self.kind.slope if self.is_slope else self.kind.value)(argument)
@@ -107,9 +109,7 @@ class Function:
         argument = self.scale * x + self.shift
         return next(((low, high) for low, high in self.kind.domain if low < argument < high), None)
 
-    def keep_inside(
-        self, x: Float[np.ndarray, " samples"], margin: float
-    ) -> Float[np.ndarray, " samples"]:
+    def keep_inside(self, x: Samples, margin: float) -> Samples:
         """Move values of the variable into the interval of the domain that holds their median.
 
         They end no nearer to its ends than a margin.
@@ -118,9 +118,7 @@ class Function:
         low, high = sorted((end - self.shift) / self.scale for end in home)
         return np.clip(x, low + margin, high - margin)
 
-    def misplaced(
-        self, x: Float[np.ndarray, " samples"], beside: Float[np.ndarray, " _"]
-    ) -> Bool[np.ndarray, " samples"]:
+    def misplaced(self, x: Samples, beside: Samples) -> Mask:
         """Mask of the values x of the variable at which the function cannot be used.
 
         These values do not lie in the same interval of the domain as `next to`, or give an f or f'
@@ -145,10 +143,6 @@ class Function:
         above = f"{argument} > {number_text(low)}" if np.isfinite(low) else ""
         below = f"{argument} < {number_text(high)}" if np.isfinite(high) else ""
         return " and ".join(filter(None, [above, below])) or "finite values"
-
-    @property
-    def _plain(self) -> bool:
-        return self.scale == 1.0 and self.shift == 0.0
 
     def _bridged(self, argument: Any) -> Any:
         """Apply a user's NumPy function to a torch tensor; its slope provides the gradient."""
@@ -214,11 +208,7 @@ def variable_factor(name: str) -> Function:
 
 
 def register_function(
-    name: str,
-    value: Values,
-    derivative: Values,
-    *,
-    domain: Interval = (-np.inf, np.inf),
+    name: str, value: Values, derivative: Values, *, domain: Interval = (-np.inf, np.inf)
 ) -> None:
     """Register a function of your own, so that terms can use it: `tanh(x)` or `tanh(2*x)`.
 

@@ -234,11 +234,8 @@ class Library:
 
     @property
     def _by_degree(self) -> dict[int, list[str]]:
-        degrees = self.degrees.tolist()
-        found: dict[int, list[str]] = {degree: [] for degree in sorted(set(degrees))}
-        for name, degree in zip(self.names, degrees, strict=True):
-            found[degree].append(name)
-        return found
+        pairs = [*zip(self.degrees.tolist(), self.names, strict=True)]
+        return {d: [n for k, n in pairs if k == d] for d in sorted({k for k, _ in pairs})}
 
     def index(self, name: str) -> int:
         """Position of a term; factors may come in any order. Raises ValueError if absent."""
@@ -324,26 +321,15 @@ class Library:
             values = [f.value(x) for f, x in zip(self.functions, of, strict=True)]
         return xp.concat([columns, *values], axis=axis)
 
-    def at_points(
-        self, known: Sequence[str], rows: np.ndarray | None = None
-    ) -> tuple[Float[np.ndarray, " known"], Callable[[], Float[np.ndarray, " rows"]]]:
+    def at_points(self) -> tuple[Float[np.ndarray, " variables"], Callable[[], np.ndarray]]:
         """Evaluate terms at one point after another, for solvers: one gather and product per call.
 
-        Returns an array to be filled with the variables in the order of `known`, and a function
-        that evaluates the terms (only `rows`, if given) at the current content of that array.
+        Returns an array to be filled with the variables, and a function that evaluates the terms at
+        the current content of that array.
         """
-        n = len(known)
-        columns, others = (
-            np.ones(n + 1 + len(self.functions)),
-            range(n, n + 1 + len(self.functions)),
-        )
-        places = np.array([*map(list(known).index, self.variables), *others])
-        table = places[self.table if rows is None else self.table[rows]]
-        functions = [
-            (n + 1 + k, f, list(known).index(f.variable))
-            for k, f in enumerate(self.functions)
-            if n + 1 + k in table
-        ]
+        n, table = len(self.variables), self.table
+        columns = np.ones(n + 1 + len(self.functions))
+        functions = [*zip(range(n + 1, len(columns)), self.functions, self._arguments, strict=True)]
 
         def terms() -> np.ndarray:
             for place, function, argument in functions:

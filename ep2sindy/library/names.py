@@ -103,9 +103,8 @@ class Part:
     @property
     def text(self) -> str:
         """Factor without its power: `x`, `sin(2*x)`, `1/x`, `1/(0.5+x)`."""
-        if self.function != RECIPROCAL:
-            return f"{self.function}({self.argument})" if self.function else self.variable
-        return f"1/{self.argument}" if self.is_bare else f"1/({self.argument})"
+        is_call = self.function not in ("", RECIPROCAL) or not self.is_bare
+        return self.function + (f"({self.argument})" if is_call else self.argument)
 
 
 def number_text(value: float) -> str:
@@ -129,14 +128,11 @@ def split_term(name: str) -> list[Part]:
     for found in _FACTORS.finditer(name):
         function = RECIPROCAL if found["over"] else found["function"] or ""
         variable, scale, shift = _split_argument(found["argument"] or found["variable"])
-        parts.append(Part(function, variable, scale, shift, _power(found["power"], name)))
+        power = found["power"] or "1"
+        if len(power) > LONGEST_POWER:
+            raise ValueError(f"a power must have up to {LONGEST_POWER} digits, got {name!r:.80}")
+        parts.append(Part(function, variable, scale, shift, int(power)))
     return parts
-
-
-def _power(text: str | None, name: str) -> int:
-    if len(text or "") > LONGEST_POWER:
-        raise ValueError(f"a power must have up to {LONGEST_POWER} digits, got {name!r:.80}")
-    return int(text or 1)
 
 
 def _split_argument(text: str) -> tuple[str, float, float]:

@@ -29,6 +29,7 @@ _ADDEND = re.compile(
 )
 
 Place = tuple[str, str]  # (state, term)
+Support = Mapping[str, Sequence[str]]  # state -> terms of its equation
 
 _EXAMPLE = "write it like 'n_i: n_i*n_n == -1 * n_n: n_i*n_n'"
 
@@ -148,9 +149,7 @@ class Constraint:
 
 
 def constraint(
-    library: NamedTerms,
-    support: Mapping[str, Sequence[str]],
-    relations: Sequence[Relation | str] = (),
+    library: NamedTerms, support: Support, relations: Sequence[Relation | str] = ()
 ) -> Constraint:
     """Eliminate one coefficient of the support per relation that does not follow from others.
 
@@ -252,9 +251,7 @@ def relations_of(relations: Sequence[Relation | str]) -> tuple[Relation, ...]:
     return tuple(parse_relation(r) if isinstance(r, str) else r for r in relations)
 
 
-def binding(
-    relations: Sequence[Relation], support: Mapping[str, Sequence[str]]
-) -> tuple[Relation, ...] | None:
+def binding(relations: Sequence[Relation], support: Support) -> tuple[Relation, ...] | None:
     """Relations whose terms are all in a support; None if the support violates a relation.
 
     A relation with value zero holds trivially if all of its terms are absent. If only some are

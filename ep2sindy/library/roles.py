@@ -1,7 +1,8 @@
 """Roles of terms in equations of balance: what one state gives another, loses, or is supplied with.
 
 A process is a term with its role. It may stand in several equations, with fixed factors, so that a
-search takes it into all of them or into none, and what it moves is conserved.
+search takes it into all of them or into none, and what it moves is conserved. Equations by process
+show what enters, is exchanged and leaves, with common factors taken out.
 """
 
 from __future__ import annotations
@@ -22,6 +23,9 @@ from ep2sindy.library.terms import NamedTerms, read_term
 from ep2sindy.runtime.values import check_list
 
 KNOWN, FREE, EITHER = "known", "free", "known or free"
+
+Equations = Mapping[str, Mapping[str, float]]  # state -> term -> number
+Processes = Sequence[Process]
 
 
 class Role(NamedTuple):
@@ -321,15 +325,11 @@ class Roles:
     def _played(self, role: Role, library: NamedTerms) -> Iterator[Process]:
         """The processes by which a role may be played."""
         giver, taker, how = role
-        if not giver:
-            names = ["1"] if how == FREE else [library.names[library.index(term)] for term in how]
-            yield from (self._process(role, term) for term in names)
-            return
-        terms = [name for name in library.names if name != "1"] if how == FREE else how
-        terms = [library.names[library.index(term)] for term in terms]
+        free = [name for name in library.names if name != "1"] if giver else ["1"]
+        terms = free if how == FREE else [library.names[library.index(term)] for term in how]
         if how == FREE and not taker:
             terms = [term for term in terms if set(factors_of(term)) == set(_bodies(giver))]
-        if not self.nonnegative:
+        if not (giver and self.nonnegative):
             yield from (self._process(role, term) for term in terms)
             return
         if how != FREE and (wrong := [term for term in terms if not _holds(term, giver)]):
@@ -417,7 +417,7 @@ def _carriers(state: str, others: Sequence[str]) -> list[str]:
     return [state, *(product_of(Counter([state, other])) for other in others)]
 
 
-def sum_known(processes: Sequence[Process]) -> dict[Place, float]:
+def sum_known(processes: Processes) -> dict[Place, float]:
     """What processes with known coefficients add to the coefficients of a model, in SI."""
     found: dict[Place, float] = {}
     for process in processes:
@@ -427,10 +427,7 @@ def sum_known(processes: Sequence[Process]) -> dict[Place, float]:
 
 
 def constraint_of(
-    library: NamedTerms,
-    states: Sequence[str],
-    processes: Sequence[Process],
-    known: Sequence[Process] = (),
+    library: NamedTerms, states: Sequence[str], processes: Processes, known: Processes = ()
 ) -> Constraint | None:
     """The exact constraint of a model with these processes, and those with known coefficients.
 
@@ -459,9 +456,7 @@ def process_matrix(held: Constraint) -> Float[np.ndarray, "free processes"]:
     return np.array([[p.factors.get(at, 0.0) for p in held.processes] for at in places])
 
 
-def process_amounts(
-    held: Constraint, terms: Mapping[str, Mapping[str, float]]
-) -> list[tuple[Process, float]]:
+def process_amounts(held: Constraint, terms: Equations) -> list[tuple[Process, float]]:
     """Every process with its coefficient, those to be found first; terms of a model by state."""
     known = sum_known(held.known)
     places = [held.coefficients[k] for k in held.free]
@@ -478,3 +473,98 @@ def _independent_rows(matrix: Float[np.ndarray, "rows columns"]) -> np.ndarray:
         if np.linalg.matrix_rank(matrix[[*found, k]]) > len(found):
             found.append(k)
     return np.array(found, dtype=np.int64)
+
+
+# Equations by process.
+
+
+IN, OUT = " in", " out"  # what enters is written first, and what leaves last
+SEPARATE = (IN, " free", " known")  # roles whose terms are written one by one
+
+
+@dataclass(frozen=True)
+class Group:
+    """A part of an equation, sign * factor * (sum of terms).
+
+    sign: 1 or -1. factor: what all terms have in common, such as `n_i*n_n`; "1" if nothing, or for
+    a single term. terms: what is left of each -> its coefficient. reach: half-width of the interval
+    of each coefficient, as far as it is known.
+    """
+
+    sign: int
+    factor: str
+    terms: Mapping[str, float]
+    reach: Mapping[str, float] = field(default_factory=dict)
+
+
+Part = tuple[str, float, float, float]  # a process in an equation: term, factor, amount, half-width
+
+
+def groups_of(
+    held: Constraint, coef: Equations, reach: Equations | None = None, *, per: float = 1.0
+) -> dict[str, list[Group]]:
+    """The equations of a model under roles: state -> its groups, what enters first.
+
+    held: from a search under `Roles`. coef: coefficients of the model in SI. reach: half-widths of
+    their intervals. per: time unit of the numbers, in s. What states exchange has the same terms
+    and digits in both of their equations. A process has an interval if one of the equations tells
+    it apart from others by the same term.
+    """
+    amounts = process_amounts(held, coef)
+    widths = [*_process_widths(held, reach or {}), *(0.0 for _ in held.known)]
+    found: dict[str, list[Group]] = {}
+    for state in held.states:
+        parts: dict[str, list[Part]] = {}  # by role
+        for (process, value), reached in zip(amounts, widths, strict=True):
+            role = process.role
+            key = f"{role} {process.term}" if role.endswith(SEPARATE) else role
+            for (there, term), factor in process.factors.items():
+                if there == state:
+                    amount, width = (per * abs(factor) * each for each in (value, reached))
+                    parts.setdefault(key, []).append((term, factor, amount, width))
+        order = sorted(parts, key=lambda key: (key.endswith(OUT)) - (IN in key))
+        found[state] = [_group(parts[key]) for key in order]
+    return found
+
+
+def _process_widths(held: Constraint, reach: Equations) -> list[float]:
+    """Half-width of the interval of every process; zero if no equation gives it alone.
+
+    Where two processes have one term in an equation, its interval is that of their sum.
+    """
+    fitted = Counter(place for process in held.processes for place in process.factors)
+    return [
+        next(
+            (
+                reach.get(state, {}).get(term, 0.0) / abs(factor)
+                for (state, term), factor in process.factors.items()
+                if fitted[state, term] == 1
+            ),
+            0.0,
+        )
+        for process in held.processes
+    ]
+
+
+def _group(parts: Sequence[Part]) -> Group:
+    """One process in one equation, with a sign such that not all of its terms are negative."""
+    sign = 1 if parts[0][1] > 0.0 else -1
+    terms = {term: amount for term, _, amount, _ in parts}
+    if all(value < 0.0 for value in terms.values()):
+        sign, terms = -sign, {term: -value for term, value in terms.items()}
+    powers = {term: factors_of(term) for term in terms}
+    first, *others = powers.values()
+    common = {name: min([n, *(p.get(name, 0) for p in others)]) for name, n in first.items()}
+    if not others or not any(common.values()):
+        common = {}
+    left = {
+        term: product_of({name: n - common.get(name, 0) for name, n in own.items()})
+        if common else term
+        for term, own in powers.items()
+    }  # fmt: skip
+    return Group(
+        sign,
+        product_of(common),
+        {left[term]: value for term, value in terms.items()},
+        {left[term]: width for term, _, _, width in parts if width > 0.0},
+    )

@@ -127,12 +127,12 @@ def unit_product(factors: Iterable[tuple[str, int | float]]) -> str:
     return " ".join(parts) or "1"
 
 
-def with_prefix(value: float) -> tuple[float, str]:
-    """Factor and SI prefix that bring a value between 1 and 1000: 1.4e4 -> (1e-3, "k")."""
-    prefixes = {-9: "n", -6: "u", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}
+def with_prefix(value: float, unit: str) -> tuple[float, str]:
+    """Factor and unit that bring a value between 1 and 1000: 1.4e4 in Hz -> (1e-3, "kHz")."""
+    prefixes = {-9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}
     power = 3 * math.floor(math.log10(value) / 3) if 0 < value < math.inf else 0
     power = min(max(power, -9), 9)
-    return 10.0**-power, prefixes[power]
+    return 10.0**-power, f"{prefixes[power]}{unit}"
 
 
 # Units of time as names of columns, and at the end of names for time.
@@ -239,15 +239,13 @@ class Clock:
         """Factor from seconds to the displayed unit, and that unit: (1e6, "µs")."""
         if self.unit != "s":
             return 1.0 / self.seconds, self.unit
-        factor, prefix = with_prefix(duration_s)
-        return factor, f"{prefix.replace('u', 'µ')}s"
+        return with_prefix(duration_s, "s")
 
     def frequency_scale(self, frequency_Hz: float) -> tuple[float, str]:
         """Factor from Hz to the displayed unit, and that unit: (1e-3, "kHz"), (3.2e7, "1/year")."""
         if self.unit != "s":
             return self.seconds, f"1/{self.unit}"
-        factor, prefix = with_prefix(frequency_Hz)
-        return factor, f"{prefix.replace('u', 'µ')}Hz"
+        return with_prefix(frequency_Hz, "Hz")
 
     def duration_text(self, duration_s: float, *, digits: int = 3) -> str:
         """Duration as text: `182 µs`, `21 years`; a dash if it is not finite."""

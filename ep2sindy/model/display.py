@@ -6,8 +6,8 @@ import html
 from collections.abc import Mapping
 
 from ep2sindy.library.equations import Sum, equation_html, equation_parts
-from ep2sindy.library.processes import groups_of
 from ep2sindy.library.relations import Constraint
+from ep2sindy.library.roles import groups_of
 from ep2sindy.library.units import SECONDS, Clock
 from ep2sindy.model.vector_field import Equations
 from ep2sindy.runtime.screen import N_LINES, cut, wrap

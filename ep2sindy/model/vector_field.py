@@ -136,7 +136,7 @@ class VectorField:
 
     def at_point(self) -> tuple[np.ndarray, Callable[[], np.ndarray]]:
         """For solvers: an array for the values of one point, and a function for f at them."""
-        values, terms = self.library.at_points(self.library.variables)
+        values, terms = self.library.at_points()
         return values, lambda: terms() @ self.coef
 
     def with_perturbations(self) -> VectorField:

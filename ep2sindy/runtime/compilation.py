@@ -13,8 +13,8 @@ import numba
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, _CacheLocator
 from numba.core.compiler import Compiler
 
+from ep2sindy.runtime.files import cache_folder
 from ep2sindy.runtime.screen import say_once
-from ep2sindy.runtime.user_cache import cache_folder
 from ep2sindy.trust.user_code import PACKAGE
 
 THIS = Path(__file__)
@@ -41,11 +41,7 @@ class SeparateArrays(Compiler):
 SEPARATE_ARRAYS: dict[str, Any] = {"pipeline_class": SeparateArrays}
 
 # How kernels are compiled that are nothing but loops over separate arrays that they are given.
-LOOPS: dict[str, Any] = {
-    "fastmath": {"contract"},
-    "error_model": "numpy",
-    **SEPARATE_ARRAYS,
-}
+LOOPS: dict[str, Any] = {"fastmath": {"contract"}, "error_model": "numpy", **SEPARATE_ARRAYS}
 
 # The same for kernels that only kernels call, from several places: they are compiled once and then
 # inlined. Where there is one place, `inline="always"` is faster to compile.

@@ -7,12 +7,13 @@ import sys
 from collections.abc import Callable, Collection, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
-from typing import Protocol, TypeVar, runtime_checkable
+from typing import Protocol, TypeAlias, TypeVar, runtime_checkable
 
 from ep2sindy.runtime.screen import in_line
 
 Piece = TypeVar("Piece")
 Advance = Callable[[int], None]
+Stage: TypeAlias = AbstractContextManager[Advance]
 
 
 def nothing(n_more: int) -> None:
@@ -29,9 +30,7 @@ class Progress(Protocol):
     empty for work that is not counted. label: name of the computation.
     """
 
-    def stage(
-        self, total: int | None, unit: str, label: str = ""
-    ) -> AbstractContextManager[Advance]: ...
+    def stage(self, total: int | None, unit: str, label: str = "") -> Stage: ...
 
 
 @dataclass(frozen=True)
@@ -87,9 +86,7 @@ class CallbackProgress:
 
     advance: Advance
 
-    def stage(
-        self, total: int | None, unit: str, label: str = ""
-    ) -> AbstractContextManager[Advance]:
+    def stage(self, total: int | None, unit: str, label: str = "") -> Stage:
         return nullcontext(self.advance)
 
 

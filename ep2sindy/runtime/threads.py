@@ -35,15 +35,22 @@ def one_thread() -> Iterator[None]:
     """
     torch = sys.modules.get("torch")  # not imported here, since the import is slow
     n_threads = torch.get_num_threads() if torch else 1
-    _INSIDE.enter(n_threads)
+    with _INSIDE.lock:
+        if not _INSIDE.count:
+            _INSIDE.limits, _INSIDE.n_before = _pools(len(sys.modules)).limit(limits=1), n_threads
+        _INSIDE.count += 1
     try:
         if torch:
             torch.set_num_threads(1)
         yield
     finally:
-        n_before = _INSIDE.leave()
+        with _INSIDE.lock:
+            _INSIDE.count -= 1
+            if not _INSIDE.count:
+                _INSIDE.limits.restore_original_limits()
+                n_threads = max(n_threads, _INSIDE.n_before)
         if torch:
-            torch.set_num_threads(max(n_threads, n_before))
+            torch.set_num_threads(n_threads)
 
 
 @dataclass
@@ -54,21 +61,6 @@ class _Inside:
     count: int = 0
     limits: Any = None
     n_before: int = 1
-
-    def enter(self, n_threads: int) -> None:
-        with self.lock:
-            if not self.count:
-                self.limits, self.n_before = _pools(len(sys.modules)).limit(limits=1), n_threads
-            self.count += 1
-
-    def leave(self) -> int:
-        """PyTorch's threads before, if nobody is inside any more; else one."""
-        with self.lock:
-            self.count -= 1
-            if self.count:
-                return 1
-            self.limits.restore_original_limits()
-            return self.n_before
 
 
 _INSIDE = _Inside()

@@ -7,6 +7,12 @@ from operator import index
 from typing import Protocol, SupportsIndex, cast
 
 import numpy as np
+from jaxtyping import Bool, Float
+
+# Signals over the samples of a record: one, several side by side, and a choice of samples.
+Samples = Float[np.ndarray, " samples"]
+Columns = Float[np.ndarray, "samples columns"]
+Mask = Bool[np.ndarray, " samples"]
 
 
 def read_only(values: np.ndarray) -> np.ndarray:

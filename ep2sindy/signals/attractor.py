@@ -10,11 +10,10 @@ from scipy import fft
 
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.runtime.values import read_only
+from ep2sindy.runtime.values import Samples, read_only
 from ep2sindy.signals.spectrum import (
     Bins,
     ByState,
-    Samples,
     States,
     is_uniform,
     noise_floor,

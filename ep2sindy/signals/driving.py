@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy.interpolate import make_interp_spline
 
 from ep2sindy.data.gaps import between_gaps
@@ -19,10 +20,9 @@ from ep2sindy.data.runs import Run, trajectory_of
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library
 from ep2sindy.library.units import Clock, seconds_in
-from ep2sindy.runtime.values import check_positive
+from ep2sindy.runtime.values import Samples, check_positive
 from ep2sindy.signals.attractor import Cycle, find_cycle
 from ep2sindy.signals.signal import Signal
-from ep2sindy.signals.spectrum import Samples
 
 DRIVE = ("cos_drive", "sin_drive")  # inputs that stand for a drive of known period
 
@@ -156,9 +156,8 @@ class PhaseRecord:
     @property
     def has_moving_phase(self) -> bool:
         """Whether the phase moves from period to period by more than noise explains."""
-        return (
-            len(self.phase) >= MIN_PERIODS_OF_PHASE and self.moved > 2.0 * LEAST_MOVES * self.noise
-        )
+        least = 2.0 * LEAST_MOVES * self.noise
+        return len(self.phase) >= MIN_PERIODS_OF_PHASE and self.moved > least
 
     @property
     def returns(self) -> bool:
@@ -261,14 +260,12 @@ def _gain(signal: Signal, t: np.ndarray, u: np.ndarray) -> float:
     if not (np.isfinite(beside).all() and np.ptp(beside) > 0.0):
         return 0.0
     beside = (beside - beside.mean()) / beside.std()
-    ends = range(N_LAGS + 1)
-    past = np.column_stack(
-        [np.ones(len(x) - N_LAGS), *(x[k : len(x) - N_LAGS + k] for k in ends[:-1])]
-    )
-    both = [w[k : len(x) - N_LAGS + k] for w in (beside, beside**2) for k in ends]
+    windows = [sliding_window_view(w, N_LAGS + 1) for w in (x, beside, beside**2)]
+    past, after = windows[0][:, :-1], windows[0][:, -1]
+    past = np.column_stack([np.ones(len(past)), past])
     left = [
-        float(np.square(x[N_LAGS:] - rows @ np.linalg.lstsq(rows, x[N_LAGS:], rcond=None)[0]).sum())
-        for rows in (past, np.column_stack([past, *both]))
+        float(np.square(after - rows @ np.linalg.lstsq(rows, after, rcond=None)[0]).sum())
+        for rows in (past, np.column_stack([past, *windows[1:]]))
     ]
     return 1.0 - left[1] / left[0] if left[0] > 0.0 else 0.0
 
@@ -293,10 +290,8 @@ def describe_set(t: Samples, u: Samples, others: Sequence[Samples]) -> str:
     wave = np.column_stack([np.ones(len(t)), np.cos(cycle.phase), np.sin(cycle.phase)])
     columns = np.column_stack([u, *others])
     coef = np.linalg.lstsq(wave, columns, rcond=None)[0]
-    impure, lines = (
-        (columns - wave @ coef).var(axis=0) / columns.var(axis=0),
-        coef[1] - 1j * coef[2],
-    )
+    impure = (columns - wave @ coef).var(axis=0) / columns.var(axis=0)
+    lines = coef[1] - 1j * coef[2]
     leads = ((lines[1:] * lines[0].conj()).imag < 0.0).all()
     return SINE if impure[0] < PURE and leads and (PURER * impure[0] < impure[1:]).all() else ""
 

@@ -130,7 +130,14 @@ class Embedding:
         finest_s = signal.period_s / (2.0 * np.pi * self.harmonics)  # a radian of the highest one
         coarsest_s = max(signal_memory_s(t, signal.x), finest_s)
         if self.how == "rate":
-            _check_positive(signal)
+            if not signal.is_positive:
+                percentage = 100.0 * float((signal.x <= 0.0).mean())
+                raise ValueError(
+                    f"a growth rate needs a positive signal: {signal.name} falls to "
+                    f"{signal.x.min():.4g} {signal.unit}, {percentage:.2g} % of its samples are "
+                    "zero or less, and noise does not explain it; take its derivative instead "
+                    "(derivative), or an offset out of it"
+                )
             growth = LogSmoother(finest_s, coarsest_s).estimate(t, signal.x)
             states = [growth.smoothed, *_differentiate(t, growth.log, n)[1:]]
             return t, states, growth.noise_std
@@ -310,17 +317,6 @@ def embed_alike(
     if fraction <= DROWNED:
         return found
     return make("delays", f"{either}, and noise is {fraction:.2f} of its standard deviation")
-
-
-def _check_positive(signal: Signal) -> None:
-    if signal.is_positive:
-        return
-    percentage = 100.0 * float((signal.x <= 0.0).mean())
-    raise ValueError(
-        f"a growth rate needs a positive signal: {signal.name} falls to {signal.x.min():.4g} "
-        f"{signal.unit}, {percentage:.2g} % of its samples are zero or less, and noise does not "
-        "explain it; take its derivative instead (derivative), or an offset out of it"
-    )
 
 
 def _append_past(t: np.ndarray, x: np.ndarray, lags_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

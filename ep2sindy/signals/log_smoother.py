@@ -9,9 +9,8 @@ import numpy as np
 from scipy.interpolate import make_interp_spline
 
 from ep2sindy.data.numbers import least_beside_grid
-from ep2sindy.runtime.values import read_only
+from ep2sindy.runtime.values import Samples, read_only
 from ep2sindy.signals.smoothers import WienerProcess, check_memory_bounds, ratio_bounds, scale_steps
-from ep2sindy.signals.spectrum import Samples
 
 # Range of log10 of the ratio of process to measurement noise, with the mean step as the unit of
 # time and the mean as the unit of the signal: from a memory of about 30 samples to interpolation.

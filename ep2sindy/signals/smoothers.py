@@ -19,8 +19,8 @@ from scipy.linalg.lapack import dgbtrf, dgbtrs, dpbtrf, dtbtrs
 
 from ep2sindy.data.numbers import least_beside_grid, zero_to_one
 from ep2sindy.data.trajectory import check_time
-from ep2sindy.runtime.values import check_positive, read_only
-from ep2sindy.signals.spectrum import Samples, is_uniform
+from ep2sindy.runtime.values import Columns, Samples, check_positive, read_only
+from ep2sindy.signals.spectrum import is_uniform
 
 # The range extends from a memory of about 200 samples to interpolation.
 LOG10_RATIO_MIN, LOG10_RATIO_MAX = -14.0, 4.0
@@ -46,7 +46,7 @@ WIDTH = 5  # of the band on either side of the diagonal
 
 BLOCK = 262_144  # samples that are differentiated at once
 
-Columns = Float[np.ndarray, "samples columns"]
+ByColumn = Float[np.ndarray, " columns"]
 
 
 @runtime_checkable
@@ -202,9 +202,7 @@ class WienerProcess:
             by_noise[k, : n - k] = (weights[k:, : n - k] * weights[: 4 - k, k:]).sum(axis=0)
         return WienerProcess(steps, weights, by_noise, by_process)
 
-    def likelihood(
-        self, values: Columns, ratio: float
-    ) -> tuple[Float[np.ndarray, " columns"], Float[np.ndarray, " columns"]]:
+    def likelihood(self, values: Columns, ratio: float) -> tuple[ByColumn, ByColumn]:
         """Log-likelihood of each column's third differences, and the variance of its noise.
 
         The variance of the measurement noise is profiled out: its most likely value is returned. A
@@ -244,7 +242,7 @@ class WienerProcess:
         *,
         weights: Samples | float = 1.0,
         pull: Columns | float = 0.0,
-    ) -> tuple[Columns, Float[np.ndarray, " columns"], float]:
+    ) -> tuple[Columns, ByColumn, float]:
         """Noise of the samples, sum of weighted squares, and log-determinant of D D' + ratio Q.
 
         weights: W of the squares of the noise. pull: p in W e - D' c = -p, half the gradient that
@@ -289,8 +287,8 @@ class KalmanEstimate:
 
     smoothed: Columns
     derivative: Columns
-    noise_std: Float[np.ndarray, " columns"]
-    log10_ratio: Float[np.ndarray, " columns"]
+    noise_std: ByColumn
+    log10_ratio: ByColumn
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -426,7 +424,7 @@ def most_likely_ratios(
     columns: Columns,
     lowest: float = LOG10_RATIO_MIN,
     highest: float = LOG10_RATIO_MAX,
-) -> Float[np.ndarray, " columns"]:
+) -> ByColumn:
     """log10 of the noise ratio of greatest likelihood for each column, within bounds."""
     if not columns.shape[1]:
         return np.empty(0)  # LAPACK takes no empty right-hand sides

@@ -7,7 +7,7 @@ model from a start, and can also use its fixed point and the stability of its cy
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -17,6 +17,7 @@ from scipy import fft
 
 from ep2sindy.data.gaps import between_gaps
 from ep2sindy.data.numbers import rounding_s, zero_to_one
+from ep2sindy.runtime.values import Samples
 
 STEP_TOLERANCE = 1e-6  # largest relative spread of steps in uniform sampling
 
@@ -28,10 +29,10 @@ PEAK_WIDTH = 0.05  # half-width of a peak, as a fraction of its frequency; two b
 
 DECAYED = 0.1  # a run has decayed if its late spread is below this fraction of the data's
 
-Samples = Float[np.ndarray, " samples"]
 States = Float[np.ndarray, "samples n_states"]
 ByState = Float[np.ndarray, " n_states"]
 Bins = Float[np.ndarray, " bins"]
+ByRecord = float | Sequence[float]  # of one record, or of several
 
 
 def is_uniform(t: Samples) -> bool:
@@ -86,16 +87,12 @@ def dominant_frequency(t: Samples, x: Samples) -> float:
     return peak(*power_spectrum(t, x))
 
 
-def steps_in(
-    periods: float, *, frequency_Hz: float | Sequence[float], dt_s: float | Sequence[float]
-) -> float:
+def steps_in(periods: float, *, frequency_Hz: ByRecord, dt_s: ByRecord) -> float:
     """Number of time steps in the given number of periods, not rounded; median over records."""
     return float(np.median(periods / (np.asarray(frequency_Hz) * np.asarray(dt_s))))
 
 
-def samples_in_periods(
-    periods: float, *, frequency_Hz: float | Sequence[float], dt_s: float | Sequence[float]
-) -> int:
+def samples_in_periods(periods: float, *, frequency_Hz: ByRecord, dt_s: ByRecord) -> int:
     """Number of samples in the given number of periods, both ends included; median over records."""
     return round(steps_in(periods, frequency_Hz=frequency_Hz, dt_s=dt_s)) + 1
 
@@ -135,19 +132,20 @@ def crossing_frequency(t: Samples, x: Samples) -> float:
     signal that does not stand out of the noise.
     Source: Rice 1944, doi:10.1002/j.1538-7305.1944.tb00874.x.
     """
-    frequency, power = power_spectrum(t, x)
-    excess = _above_noise(power)
-    whole = float(excess.sum())
-    return float(np.sqrt((np.square(frequency) * excess).sum() / whole)) if whole else 0.0
+    return float(np.sqrt(_mean_above_noise(t, x, np.square)))
 
 
 def lost_in_means(t: Samples, x: Samples, *, width_s: float) -> float:
     """Fraction of a signal's power above the noise that means over a width in s take from it."""
+    return _mean_above_noise(t, x, lambda f_Hz: np.square(1.0 - np.sinc(f_Hz * width_s)))
+
+
+def _mean_above_noise(t: Samples, x: Samples, function: Callable[[Bins], Bins]) -> float:
+    """Mean of a function of the frequency over the power above the noise; zero without any."""
     frequency, power = power_spectrum(t, x)
     excess = _above_noise(power)
-    taken = np.square(1.0 - np.sinc(frequency * width_s))
     whole = float(excess.sum())
-    return float((taken * excess).sum()) / whole if whole else 0.0
+    return float((function(frequency) * excess).sum()) / whole if whole else 0.0
 
 
 # Least fraction of what stands out of the noise floor that a smoother must follow.
@@ -249,8 +247,7 @@ def has_decayed(
     states: States, earlier: Float[np.ndarray, "_ n_states"], fraction: float
 ) -> Bool[np.ndarray, " n_states"]:
     """True for each state whose standard deviation is below `fraction` times that of `earlier`."""
-    below: np.ndarray = states.std(axis=0) < fraction * earlier.std(axis=0)
-    return below
+    return np.less(states.std(axis=0), fraction * earlier.std(axis=0))
 
 
 def over_mean(mean: ByState, std: ByState) -> ByState:

@@ -319,7 +319,7 @@ def add_frontier(report: Report, outcomes: pd.DataFrame) -> None:
     report.add(f"{systems}, at {len(points) // points['variant'].nunique()} points. {few_words}")
     report.figure("frontier", partial(frontier_figure, points), CAPTIONS["frontier"])
     report.table("points", points, shown=False)
-    of = f"sampling rates and durations of {systems}"
+    of = f"rates and durations of {systems}"
     conclude(report, points.assign(n=1), of, picture="frontier", table="points")
 
 

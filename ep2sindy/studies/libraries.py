@@ -12,8 +12,8 @@ import numpy as np
 import xarray as xr
 
 from ep2sindy.data.quantities import KNOWN_UNITS
-from ep2sindy.data.sampling import ZoneAverage
 from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.data.zones import ZoneAverage
 from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.method import AnyMethod, Regression, of_means
 from ep2sindy.forecasting.evaluation import evaluate
@@ -28,9 +28,8 @@ from ep2sindy.report.report import Report
 from ep2sindy.runtime.progress import Progress, count_pieces
 from ep2sindy.selection.criteria import Knee
 from ep2sindy.signals.attractor import find_cycle
-from ep2sindy.signals.averaging import average_long
 from ep2sindy.signals.driving import DRIVE, add_drive, ask_whether_driven, drop_repeats
-from ep2sindy.signals.signal import prepare_signal
+from ep2sindy.signals.signal import average_long, prepare_signal
 from ep2sindy.studies.balance import ModelBalance, add_balance, model_balance
 from ep2sindy.studies.candidates import add_candidates, add_estimate
 from ep2sindy.studies.forecasts import add_forecasts, skill_of, why_none

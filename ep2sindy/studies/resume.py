@@ -14,10 +14,9 @@ from typing import Any
 from ep2sindy.data.run_files import FilePattern
 from ep2sindy.data.steps import files_of
 from ep2sindy.report.report import Report
-from ep2sindy.runtime.files import fingerprint
+from ep2sindy.runtime.files import cache_folder, fingerprint
 from ep2sindy.runtime.kept_pieces import CachedWorkers
 from ep2sindy.runtime.parallel import ONE_BY_ONE, Workers
-from ep2sindy.runtime.user_cache import cache_folder
 from ep2sindy.trust.user_code import PACKAGE, nodes_of, own_source
 
 # Settings of every study that do not change a piece's result; they may differ when a broken run is

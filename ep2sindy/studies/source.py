@@ -17,10 +17,9 @@ from ep2sindy.data.fields import clock_of, grid_points
 from ep2sindy.data.gaps import describe_breaks, describe_gaps, usual_step
 from ep2sindy.data.open import open_field
 from ep2sindy.data.quantities import STEP_DOUBT, DoubtfulUnit, to_si
-from ep2sindy.data.sampling import ZoneAverage
 from ep2sindy.data.steps import records_of
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.data.zones import Zone, describe_zone
+from ep2sindy.data.zones import Zone, ZoneAverage, describe_zone
 from ep2sindy.library.library import Library
 from ep2sindy.library.units import Clock
 from ep2sindy.report.report import Report

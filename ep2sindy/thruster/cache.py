@@ -12,10 +12,9 @@ import xarray as xr
 from tqdm import tqdm
 
 from ep2sindy.data.fields import write_netcdf
-from ep2sindy.runtime.files import fingerprint, sweep, writing
+from ep2sindy.runtime.files import cache_folder, fingerprint, sweep, writing
 from ep2sindy.runtime.progress import Progress, as_progress
 from ep2sindy.runtime.screen import in_line, on_screen
-from ep2sindy.runtime.user_cache import cache_folder
 from ep2sindy.signals import spectrum
 from ep2sindy.thruster.axial.settings import to_json
 

@@ -7,10 +7,7 @@ from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
-from ep2sindy.data.readers.hallthruster import HALLTHRUSTER
-from ep2sindy.data.readers.hdf5 import HDF5
-from ep2sindy.data.readers.matlab import MATLAB, NPZ
-from ep2sindy.data.readers.netcdf import NETCDF, ZARR
+from ep2sindy.data.readers.arrays import HALLTHRUSTER, HDF5, MATLAB, NETCDF, NPZ, ZARR
 from ep2sindy.data.readers.source import FileSource, Reader, damage_named, look_at
 from ep2sindy.data.readers.tables import CSV, NPY, TDMS
 from ep2sindy.runtime.files import check_regular

@@ -15,6 +15,8 @@ from itertools import zip_longest
 from ep2sindy.library.units import is_count, unit_like
 from ep2sindy.trust.memory import check_width
 
+Table = Sequence[Sequence[str]]  # cells of each line
+
 SEPARATORS = (",", ";", "\t", "|", None)  # None: blanks
 COMMENTS = ("#", "%", "//", "!")
 PARTED = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", None: "blanks"}
@@ -86,9 +88,7 @@ def layout_of(lines: Sequence[str]) -> Layout:
     return Layout(separator, decimal, first, columns, header, has_marks)
 
 
-def _form(
-    lines: Sequence[str],
-) -> tuple[str | None, str, tuple[int, ...], list[list[str]]]:
+def _form(lines: Sequence[str]) -> tuple[str | None, str, tuple[int, ...], list[list[str]]]:
     """Separator, decimal sign, numeric columns, and the cells of all lines.
 
     Separator and decimal sign are those by which most cells are numbers, in most columns.
@@ -123,7 +123,7 @@ def _split(lines: Sequence[str], separator: str | None) -> list[list[str]]:
     return table
 
 
-def _rate(table: Sequence[Sequence[str]], decimal: str) -> tuple[float, int, tuple[int, ...]]:
+def _rate(table: Table, decimal: str) -> tuple[float, int, tuple[int, ...]]:
     """Mean fraction of numbers in a line, number of numeric columns, and their indices.
 
     table: cells of the lines that hold a digit; columns are distinguished from those of the usual
@@ -138,7 +138,7 @@ def _rate(table: Sequence[Sequence[str]], decimal: str) -> tuple[float, int, tup
     return (sum(fractions) / len(fractions) if columns else 0.0), len(columns), columns
 
 
-def _numeric(rows: Sequence[Sequence[str]], decimal: str) -> tuple[int, ...]:
+def _numeric(rows: Table, decimal: str) -> tuple[int, ...]:
     """Indices of the columns most of whose cells, but for missing samples, are numbers.
 
     Of a table with labels next to it, columns that few rows fill belong to these.
@@ -179,9 +179,7 @@ def _is_row(cells: Sequence[str], columns: Sequence[int], decimal: str) -> bool:
     return has_numbers and all(NUMBERS[decimal].fullmatch(c) or c.lower() in MISSING for c in at)
 
 
-def _first_row(
-    table: Sequence[Sequence[str]], lines: Sequence[str], columns: Sequence[int], decimal: str
-) -> int:
+def _first_row(table: Table, lines: Sequence[str], columns: Sequence[int], decimal: str) -> int:
     """Line of the first row; raises ValueError if the next one is no row, as after a false one."""
     filled = [k for k, cells in enumerate(table) if cells]
     first = next(k for k in filled if _is_row(table[k], columns, decimal))
@@ -234,9 +232,7 @@ class Header:
     step_s: float | None = None
 
 
-def header_of(
-    above: Sequence[Sequence[str]], n_columns: int, *, strict: bool, is_comment: bool
-) -> Header:
+def header_of(above: Table, n_columns: int, *, strict: bool, is_comment: bool) -> Header:
     """Find the header in the cells of the lines above the rows.
 
     strict: a last line of several cells, or of one word, is taken as a header, so it must name
@@ -270,7 +266,7 @@ def header_of(
     return Header(plain_names, tuple(units), step_s)
 
 
-def _check_names(above: Sequence[Sequence[str]]) -> None:
+def _check_names(above: Table) -> None:
     """Raise ValueError if the last line above the rows might not be the column names.
 
     It may be a faulty row, or follow a line that begins with a name for time. One that begins so
@@ -291,7 +287,7 @@ def _check_names(above: Sequence[Sequence[str]]) -> None:
         )
 
 
-def _labels_beside(header: Header, rows: Sequence[Sequence[str]], columns: Sequence[int]) -> Header:
+def _labels_beside(header: Header, rows: Table, columns: Sequence[int]) -> Header:
     """Header with units and step from a preamble in the columns before the numbers.
 
     Older oscilloscopes of Tektronix write it there, one line in each row.
@@ -302,7 +298,7 @@ def _labels_beside(header: Header, rows: Sequence[Sequence[str]], columns: Seque
     return replace(header, units=units, step_s=header.step_s or _step_s(labels))
 
 
-def _preamble_units(above: Sequence[Sequence[str]], n_columns: int) -> tuple[str, ...]:
+def _preamble_units(above: Table, n_columns: int) -> tuple[str, ...]:
     """Units of the columns, time first, as lines of a preamble give them; "" where none does."""
     time, values = "", [""]
     for label, *cells in filter(None, above):
@@ -323,7 +319,7 @@ def _known_units(cells: Sequence[str], n_columns: int) -> tuple[str, ...]:
     return tuple([*units, *[""] * n_columns][:n_columns])
 
 
-def _step_s(above: Sequence[Sequence[str]]) -> float | None:
+def _step_s(above: Table) -> float | None:
     """Time step in s from a preamble, or None."""
     for cells in above:
         if len(cells) > 1 and STEP.fullmatch(cells[0]):
@@ -378,7 +374,7 @@ def _are_units(cells: Sequence[str], names: Sequence[str]) -> bool:
     return is_time and all(not _unit(cell) or unit_like(_plain(cell)) for cell in cells)
 
 
-def _rigol_header(above: Sequence[Sequence[str]], n_columns: int) -> Header | None:
+def _rigol_header(above: Table, n_columns: int) -> Header | None:
     """Header of a Rigol oscilloscope, or None.
 
     Its first column numbers the samples. The last cells of its two header lines give the start and

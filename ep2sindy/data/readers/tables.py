@@ -12,14 +12,7 @@ import pandas as pd
 import xarray as xr
 
 from ep2sindy.data.readers.source import FileSource, Reader, column_array
-from ep2sindy.data.readers.table_layout import (
-    COMMENTS,
-    GROUPED,
-    MISSING,
-    PARTED,
-    Layout,
-    layout_of,
-)
+from ep2sindy.data.readers.table_layout import COMMENTS, GROUPED, MISSING, PARTED, Layout, layout_of
 from ep2sindy.trust.memory import check_width
 
 N_LOOKED_AT = 2000  # lines examined to find the layout; no known preamble is longer
@@ -181,10 +174,7 @@ def _numbers(column: pd.Series, name: str, layout: Layout) -> pd.Series:
 
 
 CSV = Reader(
-    "text",
-    read_csv,
-    form="other",
-    endings=(".csv", ".tsv", ".txt", ".dat", ".asc", ".prn", ".lvm"),
+    "text", read_csv, form="other", endings=(".csv", ".tsv", ".txt", ".dat", ".asc", ".prn", ".lvm")
 )
 
 # Tables that are no text.
