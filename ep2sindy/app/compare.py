@@ -73,9 +73,9 @@ def main(arguments: Sequence[str]) -> None:
 class ReadRun:
     """The contents of a run folder.
 
-    label: the run's name in tables. about: experiment, seed and number of warnings. clock: the time
-    unit in which it is shown. headline: the headline figures; null in the file is NaN. settings: by
-    dotted place. figures: their files.
+    label: the run's name in tables. about: experiment, seed, number of warnings and the verdict on
+    what was found. clock: the time unit in which it is shown. headline: the headline figures; null
+    in the file is NaN. settings: by dotted place. figures: their files.
     """
 
     folder: Path
@@ -119,6 +119,7 @@ def read_run(folder: Path, number: int) -> ReadRun:
         summary = read_json(read_bytes(folder / "summary.json"))
         about = {"experiment": str(summary["experiment"]), "seed": str(summary["seed"])}
         about["warnings"] = str(len(summary.get("warnings", [])))
+        about["found"] = str(summary.get("found", "-"))
         headline = {
             n: nan if v is None else float(v) for n, v in summary.get("headline", {}).items()
         }
@@ -166,6 +167,7 @@ def compare_runs(runs: Sequence[ReadRun], figures: Sequence[str], *, beside: Pat
             "seed": run.about["seed"],
             "code": str(run.provenance["commit"])[:12],
             "warnings": run.about["warnings"],
+            "found": run.about["found"],
         }
         for run in runs
     ]

@@ -46,7 +46,9 @@ from ep2sindy.signals.spectrum import DECAYED, dominant_frequency
 
 IN_PHASE = 0.25  # periods, by which a run that is in phase may be ahead or behind
 STD, WIDEST = " standard deviations", len("amplitude ratio  ")
-LEFT = 100.0  # times a record's size, from which a run's is not reported
+# Times a record's size, from which and below which a run's is not reported; and of a period, of a
+# lag.
+LEFT, NOTHING, LEAST_SHOWN = 100.0, 1e-3, 0.01
 N_SHOWN = 4  # most states, and most rest points, that the table shows one by one
 
 # What a comparison with a cycle says of a run, which says nothing of a model under inputs.
@@ -333,6 +335,8 @@ class Evaluation:
         text, ahead = f"in phase for {self.periods:.3g} periods", self.phase_end
         if not abs(ahead) <= IN_PHASE:
             return text
+        if abs(ahead) < LEAST_SHOWN:
+            return f"{text}, within {LEAST_SHOWN} of a period at the end"
         side = "ahead" if ahead > 0.0 else "behind"
         return f"{text}, {abs(ahead):.2g} of a period {side} at the end"
 
@@ -434,7 +438,7 @@ class Evaluation:
         data, own = self.compared.cycle, self.frequency_Hz[states[0]]
         rows = []
         if data is not None and np.isfinite(self.f_error) and not self.is_driven:
-            error = f" ({100.0 * self.f_error:+.2g} %)"
+            error = f" ({error_text(self.f_error)})"
             rows.append(
                 (
                     "frequency",
@@ -463,7 +467,7 @@ class Evaluation:
         """Quantities and their values, as text; computes what has not been asked for."""
         clock = self.rollout.clock
         frequencies = {s: clock.frequency_text(f) for s, f in self.frequency_Hz.items() if f == f}
-        error = f" ({100.0 * self.f_error:+.2g} %)" if np.isfinite(self.f_error) else ""
+        error = f" ({error_text(self.f_error)})" if np.isfinite(self.f_error) else ""
         compared = [
             ("frequency", _listed(frequencies) + error),
             ("amplitude ratio", _listed(_sizes(self.amplitude_ratio))),
@@ -612,7 +616,14 @@ def _sizes(ratios: Mapping[str, float]) -> dict[str, str]:
 
 def size_text(ratio: float, form: str = ".3g") -> str:
     """A ratio of sizes; of a run that has left the record's, that it is far over it."""
-    return f"{ratio:{form}}" if ratio <= LEFT else f"over {LEFT:.0f}"
+    if ratio > LEFT:
+        return f"over {LEFT:.0f}"
+    return f"{ratio:{form}}" if ratio >= NOTHING else "0"
+
+
+def error_text(error: float) -> str:
+    """A relative error in percent, `+1.2 %`, or `0.00 %` for a smaller one."""
+    return f"{100.0 * error:+.2g} %" if abs(error) >= 5e-5 else "0.00 %"
 
 
 def _listed(texts: Mapping[str, str], unit: str = "") -> str:

@@ -85,7 +85,7 @@ class ForecastSkill:
     held-out samples. A baseline that the record does not allow is left out. coverage_90: fraction
     of the held-out samples that the bands of 90 % hold; NaN without bands. example: the forecast
     from the first start. order: of the autoregression. resampled: whether baselines took samples at
-    other times.
+    other times. seen: whether the model was fitted to the part that is held out from the baselines.
     """
 
     horizons_s: Float[np.ndarray, " horizons"]
@@ -98,6 +98,7 @@ class ForecastSkill:
     order: int
     clock: Clock = field(repr=False)
     resampled: bool = False
+    seen: bool = False
 
     @cached_property
     def nrmse(self) -> Mapping[str, Float[np.ndarray, " horizons"]]:
@@ -203,9 +204,10 @@ class ForecastSkill:
     def text(self) -> str:
         """The verdict by ranges of horizons, `better than an autoregression up to 4 periods`."""
         rival = "an autoregression" if self.rival == AUTOREGRESSION else "the last sample"
+        rival += " (in sample)" if self.seen else ""
         if self.better is not None:
             return f"better than {rival} {self._span(self.better)}"
-        if self.nearer is not None:
+        if self.nearer is not None and not self.seen:
             return f"nearer than {rival} {self._span(self.nearer)}, within chance"
         return f"no better than {rival}"
 

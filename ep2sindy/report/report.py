@@ -204,7 +204,7 @@ class Report:
         )
         page = page_html(self.title, self.sections, drawn, about, result=self.result)
         write_text(self.folder.file(PAGE), page)
-        named = {"experiment": self.title, "seed": self.seed}
+        named = {"experiment": self.title, "seed": self.seed, "found": self.result.title}
         named |= {"warnings": self.warnings} if self.warnings else {}
         found = named | on_clock(self.summary, self.clock) | {"headline": self.headline}
         write_json(self.folder.file("summary.json"), found)

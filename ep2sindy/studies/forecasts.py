@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -16,9 +17,9 @@ from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.studies.source import LEAST_SAMPLES, is_short
 
 CAPTION = (
-    "Forecast from the first held-out sample on, fitted to the past alone, with the band "
-    "that is to hold 90 % of the samples. Last panel: error of forecasts from starts all over the "
-    "held-out part, by horizon (1: no better than the mean); persistence: the last sample "
+    "Forecast of the last part of the record, its start estimated from the past alone, with the "
+    "band that is to hold 90 % of the samples. Last panel: error of forecasts from starts all over "
+    "that part, by horizon (1: no better than the mean); persistence: the last sample "
     "stays; harmonics: the mean cycle continues; autoregression: linear in the samples or in their "
     "logarithms, its order by AIC; neighbours: what followed the most similar moments."
 )
@@ -29,18 +30,23 @@ def why_none(run: Trajectory, n_fitted: int) -> str:
     if not is_short(run, n_fitted):
         return ""
     return (
-        f"no forecasts: they need {LEAST_SAMPLES} samples or more to fit and as many to test, and "
-        f"the {run.n_samples} of the record leave {n_fitted} and {run.n_samples - n_fitted}"
+        f"no forecasts: they need {LEAST_SAMPLES} samples or more to fit and as many to test; the "
+        f"record has {run.n_samples}, {n_fitted} to fit and {run.n_samples - n_fitted} to test"
     )
 
 
 def skill_of(
-    model: SparseModel, run: Trajectory, *, n_fitted: int, starts: int, progress: Progress = SILENT
-) -> ForecastSkill | None:
-    """Skill of a model of measured states; None for an empty model, or a short record."""
+    model: SparseModel, run: Trajectory, *, n_fitted: int, starts: int, seen: bool,
+    progress: Progress = SILENT,
+) -> ForecastSkill | None:  # fmt: skip
+    """Skill of a model of measured states; None for an empty model, or a short record.
+
+    seen: whether the model was fitted to all of the record.
+    """
     if not starts or is_short(run, n_fitted) or not model.coef.any():
         return None
-    return forecast_skill(model, run, n_fitted=n_fitted, starts=starts, progress=progress)
+    skill = forecast_skill(model, run, n_fitted=n_fitted, starts=starts, progress=progress)
+    return replace(skill, seen=seen)
 
 
 def add_forecasts(
@@ -66,4 +72,8 @@ def _note(skill: ForecastSkill) -> str:
             "throughout, or forecasts of it diverge"
         )
     steps = " Baselines take the samples interpolated onto equal steps." if skill.resampled else ""
-    return f"{skill.n_starts} starts, each fitted to the past alone; {held}.{steps}"
+    fitted = ", although the model was fitted to all of the record" if skill.seen else ""
+    return (
+        f"{skill.n_starts} starts, whose states are estimated from the past alone{fitted}; {held}."
+        f"{steps}"
+    )

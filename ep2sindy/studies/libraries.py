@@ -255,7 +255,7 @@ class Study:
             )
         skill = skill_of(
             found.model if sustained is None else sustained.model, measured, starts=self.forecasts,
-            n_fitted=self._n_fitted(measured), progress=progress,
+            n_fitted=self._n_fitted(measured), seen=sustained is None, progress=progress,
         )  # fmt: skip
         sustained = sustained and sustained.forecasting(skill)
         with progress.stage(None, "", "free runs"):

@@ -58,8 +58,8 @@ from ep2sindy.studies.views import CYCLE, EVALUATED, EVALUATION, add_samples, fo
 
 NAME = "trace"  # of the model, in files
 NOT_EXPLAINED = (
-    "no equations of the signal and of hidden states both explain it to within its noise and "
-    "sustain its oscillation: states are made by smoothing"
+    "equations with hidden states were tried first: none both explains the signal to within its "
+    "noise and sustains its oscillation, so states are made by smoothing instead"
 )
 
 LINEAR = (
@@ -288,7 +288,7 @@ def _add_signal(
         f"states: {embedding.says}, {', '.join(states.state_names)} ({best.states.reason})"
         f"{'; known: ' if exact else ''}{exact}",
         f"noise{too_fast}: {noise}, {percentage:.2g} % of the standard deviation",
-        f"process noise, which moves the states at random in every step: {moves} (SI)",
+        f"process noise, which moves the states at random in every step: {moves}",
         *signal.done,
     )
     chosen = [attempts.index(best)]

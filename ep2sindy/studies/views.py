@@ -13,7 +13,7 @@ import pandas as pd
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.figures import series
 from ep2sindy.forecasting.baselines import AUTOREGRESSION
-from ep2sindy.forecasting.evaluation import Evaluation, size_text
+from ep2sindy.forecasting.evaluation import Evaluation, error_text, size_text
 from ep2sindy.forecasting.skill import ForecastSkill
 from ep2sindy.library.relations import Constraint
 from ep2sindy.report.document import Block, Result, Table, Text
@@ -170,15 +170,12 @@ def errors_table(skill: ForecastSkill) -> Table:
     return Table(rows, title=title, note=skill.nearest_text)
 
 
-def frequency_words(run: Evaluation, form: str = "+.1f") -> str:
-    """`20 kHz (+1.2 %)`: the first state's frequency and its error; a dash if it has none.
-
-    form: of the error in percent.
-    """
+def frequency_words(run: Evaluation) -> str:
+    """`20 kHz (+1.2 %)`: the first state's frequency and its error; a dash if it has none."""
     frequency_Hz = run.frequency_Hz[run.model.states[0]]
     if not np.isfinite(frequency_Hz):
         return "-"
-    error = f" ({100 * run.f_error:{form}} %)" if np.isfinite(run.f_error) else ""
+    error = f" ({error_text(run.f_error)})" if np.isfinite(run.f_error) else ""
     return f"{run.rollout.clock.frequency_text(frequency_Hz)}{error}"
 
 
