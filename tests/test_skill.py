@@ -56,7 +56,7 @@ def test_a_gain_that_chance_may_make_is_neither_praised_nor_denied() -> None:
 def test_errors_above_the_mean_s_are_no_forecast() -> None:
     still = {"persistence": errors(2.0, seed=2), "autoregression": errors(3.0, seed=1)}
     found = skill(model=errors(1.5), **still)
-    assert found.text == "no better than an autoregression"
+    assert found.text == "forecasts no better than an autoregression"
     assert found.veto == "the mean"
     assert found.nearest_text == "Least error: the mean up to 2 periods."
     assert skill(model=errors(2.5), **still).veto == "the last sample"

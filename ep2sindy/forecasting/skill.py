@@ -209,7 +209,7 @@ class ForecastSkill:
             return f"better than {rival} {self._span(self.better)}"
         if self.nearer is not None and not self.seen:
             return f"nearer than {rival} {self._span(self.nearer)}, within chance"
-        return f"no better than {rival}"
+        return f"forecasts no better than {rival}"
 
     @property
     def nearest_text(self) -> str:
