@@ -458,8 +458,9 @@ class Evaluation:
             rows.append(("waveform", "", f"within {max(waveforms):.2g}{STD}"))
         if self.phase_text and not self.is_driven:
             rows.append(("phase", "", self.phase_text))
-        elif self.distance_text:
-            rows.append(("distance", "", self.distance_text))
+        elif np.isfinite(self.nrmse):
+            off = f"{size_text(self.nrmse)}{STD}"
+            rows.append(("distance", "", "; ".join(filter(None, [off, self.distance_text]))))
         return rows
 
     @property
