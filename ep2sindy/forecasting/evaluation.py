@@ -446,13 +446,14 @@ class Evaluation:
                     f"{clock.frequency_text(own)}{error}" if np.isfinite(own) else "-",
                 )
             )
-        for state, std in list(zip(states, self.compared.std.tolist(), strict=True))[:N_SHOWN]:
-            ratio = self.amplitude_ratio[state]
+        sizes = self.compared.std, self.compared.std * self.comparison.by_state["amplitude_ratio"]
+        if self.is_driven:
+            sizes = self.compared.states.std(axis=0), self.rollout.states.std(axis=0)
+        for state, std, own_std in list(zip(states, *sizes, strict=True))[:N_SHOWN]:
             unit = f" {self.model.units[state]}".removesuffix(" 1")
-            model = f"{ratio * std:.4g}{unit}" if ratio <= LEFT else size_text(ratio)
-            rows.append(
-                (f"amplitude of {state}", f"{std:.4g}{unit}", model if ratio == ratio else "-")
-            )
+            model = f"{own_std:.4g}{unit}" if own_std <= LEFT * std else f"over {LEFT:.0f} times"
+            known = np.isfinite(own_std)
+            rows.append((f"amplitude of {state}", f"{std:.4g}{unit}", model if known else "-"))
         waveforms = [value for value in self.waveform_error.values() if np.isfinite(value)]
         if waveforms and not self.is_driven:
             rows.append(("waveform", "", f"within {max(waveforms):.2g}{STD}"))
