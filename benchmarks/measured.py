@@ -1,170 +1,207 @@
 """Measured records, by the settings that a user meets: `python -m benchmarks.measured`.
 
-    EP2SINDY_DATA=folder python -m benchmarks.measured laser electrochemical hallthruster
-    python -m benchmarks.measured pendulum populations process_noise hidden offset
+    EP2SINDY_DATA=folder python -m benchmarks.measured laser flutter headings
+    python -m benchmarks.measured pendulum hares gause process_noise hidden offset
 
-`+exp=trace` as it comes is run on every record; what differs is in its table. Errors are
-root mean squares over starts, in standard deviations of the held-out samples, next to persistence
-and an autoregression by AIC; every start is fitted to the past alone. Records that are not shipped
+Every record is cut or split at several places: one split may be a lucky draw. The models are those
+of `+exp=trace` as it comes; what differs is in `RECORDS`. Printed are medians and ranges of the
+errors of forecasts: root mean squares over starts, in standard deviations of the held-out samples,
+next to an autoregression by AIC and others. `headings` asks whether what the headings of all
+records say holds at more starts, and next to another autoregression. Records that are not shipped
 lie in the folder of EP2SINDY_DATA. Prints tables of docs/trace.md and docs/estimation.md.
 """
 
 from __future__ import annotations
 
-import json
 import os
-import subprocess
 import sys
-import tempfile
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import cache, partial
 from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
+from hydra import compose, initialize_config_dir
 
 import ep2sindy as ep
-from ep2sindy.discovery.one_signal import fit_offset
+from ep2sindy.app.runner import study_class
+from ep2sindy.app.schema import study_of
+from ep2sindy.discovery import one_signal
+from ep2sindy.forecasting.evaluation import Evaluation
 from ep2sindy.signals.spectrum import crossing_frequency
 
-FOLDER = Path(os.environ.get("EP2SINDY_DATA", "."))
-N_DRAWS, N_MOVED = 10, 20
-PROCESS = 0.05  # noise
-N_CYCLES = 2
-DRY_FRICTION = "{how: auto, degree: 1, functions: ['sign(200*v)']}"
+FOLDER, CONF = Path(os.environ.get("EP2SINDY_DATA", ".")), Path(__file__).parents[1] / "conf"
+N_DRAWS, N_MOVED, N_CYCLES, PROCESS_NOISE = 10, 20, 2, 0.05
+DRY_FRICTION = "tried=[{how: auto, degree: 1, functions: ['sign(200*v)']}]"
 POINTS = ((300.0, 5.0), (300.0, 4.0), (300.0, 6.0), (400.0, 5.0))  # V and mg/s
+SAID = ("no equations found", "no better", "within chance", "better", "")  # first in a heading
+AHEAD = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0)  # periods, or samples without one
+DENSE, GAIN, LAGS = 200, 0.9, (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48)  # of the check of headings
 
 
-@dataclass(frozen=True, eq=False)
-class Traced:
-    """What `+exp=trace` wrote: summary, and errors by horizon."""
-
-    summary: dict[str, Any]
-    errors: pd.DataFrame
-
-    def at(self, horizon_s: float) -> str:
-        """Errors at a horizon, of the model and of the autoregression."""
-        if self.errors.empty:
-            return "-"
-        row = self.errors.iloc[int(np.argmin(np.abs(self.errors["horizon_s"] - horizon_s)))]
-        names = [name for name in ("model", "autoregression", "persistence") if name in row]
-        return ", ".join(f"{name} {row[name]:.3f}" for name in names)
+def trace(run: ep.Trajectory, *more: str) -> Evaluation:
+    """How the model of `+exp=trace` does on the rest of a record of one signal."""
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        config = compose("config", overrides=["+exp=trace", *more])
+    study = study_of(study_class("trace"), config)
+    signal = ep.signals.prepare_signal(run, decimate=study.decimate, detrend=study.detrend)
+    past = one_signal.fitted_part(signal, study.held_out)
+    attempts = one_signal.try_in_turn(past, study.tried, study.method)
+    return one_signal.run_on_rest(signal, one_signal.best_of(attempts))[1]
 
 
-def trace(t: np.ndarray, x: np.ndarray, *more: str) -> Traced | str:
-    """Run `+exp=trace` on a file of two columns; what it says if it refuses."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "record.csv"
-        np.savetxt(path, np.column_stack([t, x]), delimiter=",", header="time,x", comments="")
-        given = ["+exp=trace", "data=file", f"data.path={path}", "signal=x", f"output={folder}"]
-        command = [sys.executable, "-m", "experiments.run", *given, *more]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        if done.returncode:
-            return (done.stderr or done.stdout).strip().splitlines()[-1]
-        result = Path(done.stdout.split()[-1]).parent  # of the page
-        errors = result / "tables" / "forecast_trace.csv"
-        return Traced(
-            json.loads((result / "summary.json").read_text()),
-            pd.read_csv(errors) if errors.exists() else pd.DataFrame(),
-        )
+def parts(
+    runs: Iterable[ep.Trajectory], held_out: Iterable[float] = (0.25,), *more: str
+) -> Iterator[Evaluation]:
+    return (trace(run, f"held_out={each}", *more) for run, each in product(runs, held_out))
 
 
-def show(name: str, found: Traced | str, horizons: dict[str, float]) -> None:
-    """A few lines for a record."""
+def read(name: str, column: str, inputs: Sequence[str] = ()) -> ep.Trajectory:
+    """A signal of a file, next to its inputs, over the first column."""
+    table = pd.read_csv(FOLDER / f"{name}.csv").astype(float)
+    columns = table.iloc[:, 0].to_numpy(), table[[column]].to_numpy(), ("x",)
+    return ep.Trajectory(*columns, table[[*inputs]].to_numpy(), tuple(inputs))
+
+
+def named_terms(run: ep.Trajectory, fitted: Sequence[int]) -> Iterator[Evaluation]:
+    """Of predator and prey, of which so many samples are fitted; their terms are named."""
+    first, second = run.state_names
+    both = f"{first}*{second}"
+    library = ep.polynomial(run.names).only({first: (first, both), second: (second, both)})
+    for n in fitted:
+        found = ep.discover(run.window(0, n), library)
+        skill = partial(ep.model.forecast_skill, found.model, run, n_fitted=n)
+        yield replace(ep.evaluate(found, run.window(n - 1, run.n_samples)), forecasts=skill)
+
+
+LASER = [*((k, k + 700) for k in range(0, 500, 100)), (0, 1000), (0, 1100)]
+FIFTHS = [(2000 * k, 2000 * (k + 1)) for k in range(5)]
+CIRCUIT = [*((k, k + 1000) for k in range(0, 1250, 250)), (0, 2000)]
+FLUTTER = sorted(path.stem for path in FOLDER.glob("flutter/*.csv"))
+QUARTER, SWING = (0.2, 0.225, 0.25, 0.275, 0.3), (0.24, 0.28, 0.32, 0.36, 0.4)  # held out
+# Models of the parts of a record, which is cut or split at several places.
+RECORDS: dict[str, Callable[[], Iterator[Evaluation]]] = {
+    "laser": lambda: parts(read("laser", "I").window(*each) for each in LASER),
+    "electrochemical": lambda: parts(read("electrochemical", "I").window(*k) for k in FIFTHS),
+    "silverbox": lambda: parts(read("silverbox", "y", ["u"]).window(*k) for k in CIRCUIT),
+    "flutter": lambda: parts(read(f"flutter/{name}", "h") for name in FLUTTER),
+    "grows": lambda: parts([read("hallthruster_landmark_3", "I_d")], QUARTER),
+    "decays": lambda: parts([read("hallthruster_landmark_2", "I_d")], QUARTER),
+    "pendulum": lambda: parts([ep.data.pendulum_swing()], SWING),
+    "friction": lambda: parts([ep.data.pendulum_swing()], SWING, DRY_FRICTION),
+    "hares": lambda: named_terms(ep.data.hare_lynx(), range(12, 17)),
+    "gause": lambda: named_terms(ep.data.gause(), range(10, 15)),
+}
+
+
+@cache
+def models(name: str) -> Sequence[Evaluation]:
+    return tuple(RECORDS[name]())
+
+
+def show(name: str) -> None:
+    """Errors over the parts of a record, and what the headings say."""
     print(f"\n{name}")
-    if isinstance(found, str):
-        print(f"  refused: {found}")
-        return
-    run, signal = found.summary["evaluations"]["trace"], found.summary["signal"]
-    n_terms = found.summary["headline"]["n_terms"]
-    print(f"  {signal['n_states']} states, {n_terms:g} terms: {run['status']}")
-    for state, terms in found.summary["models"]["trace"]["equations"].items():
-        print(f"    {state}' = " + " ".join(f"{c:+.3g} {term}" for term, c in terms.items()))
-    for words, horizon in horizons.items():
-        print(f"  {words} ahead: {found.at(horizon)}")
-    if forecast := found.summary.get("forecasts", {}).get("trace"):
-        print(f"  {forecast['text']}")
-        print(f"  {text_of_bands(forecast['coverage_90'])}", flush=True)
+    skills = [free.forecast for free in models(name) if free.forecast is not None]
+    for free, skill in zip(models(name), skills, strict=True):
+        n_terms = sum(len(free.model.terms(state)) for state in free.model.states)
+        print(f"  {n_terms} terms; bands of 90 % hold {skill.coverage_90:.0%}: {free.heading}")
+    for ahead in AHEAD:
+        in_s = [(each, ahead * each.unit_s) for each in skills]
+        near = [each.at(h_s) for each, h_s in in_s if h_s < 1.02 * each.horizons_s[-1]]
+        if not near:
+            break
+        words = (f"{who} {each.median():.2g} ({each.min():.2g} to {each.max():.2g})"
+                 for who, each in pd.DataFrame(near).items())  # fmt: skip
+        print(f"  {ahead:g} periods ahead, {len(near)} of {len(skills)}: {', '.join(words)}")
+    said = [next(words for words in SAID if words in free.heading) for free in models(name)]
+    for counts in (Counter(said), Counter(str(free.status) for free in models(name))):
+        print("  " + ", ".join(f"{words or 'else'} {n}" for words, n in counts.items()), flush=True)
 
 
-def text_of_bands(held: float | None) -> str:
-    """How much of the samples bands of 90 % hold; None or NaN if none are shown."""
-    if held is None or not np.isfinite(held):
-        return "no bands"
-    return f"bands of 90 % hold {100 * held:.0f} %"
+def headings() -> None:
+    """Whether headings of all records hold at two hundred starts."""
+    rows = [(contradiction(free), name, free.heading) for name in RECORDS for free in models(name)]
+    for row in filter(lambda each: each[0], rows):
+        print(": ".join(row))
+    counts = Counter(wrong for wrong, *_ in rows)
+    print(
+        f"{len(rows)} headings, {counts['false praise']} false praises, {counts['denial']} denials"
+    )
 
 
-def read(name: str, column: str) -> tuple[np.ndarray, np.ndarray]:
-    table = pd.read_csv(FOLDER / f"{name}.csv")
-    return table.iloc[:, 0].to_numpy(float), table[column].to_numpy(float)
+def contradiction(free: Evaluation) -> str:
+    """What more starts and another autoregression say against a heading; empty if nothing.
+
+    False praise: the mean square error over the claimed horizons is not below the rivals'. Denial:
+    at over half of the horizons the error is a tenth or more below theirs and that of the mean.
+    """
+    skill: Any = free.forecast
+    forecasts: Any = free.forecasts
+    dense, run, n = forecasts(starts=DENSE), forecasts.args[1], forecasts.keywords["n_fitted"]
+    own, rival = dense.nrmse["model"], dense.nrmse[dense.rival]
+    if not dense.resampled:
+        rival = np.minimum(rival, linear_errors(run, n, dense.horizons_s))
+    if skill.text in free.heading and (span := skill.better or skill.nearer):
+        part = slice(span[0], span[1] + 1)
+        return "false praise" if np.mean(own[part] ** 2 - rival[part] ** 2) >= 0.0 else ""
+    gains = own < GAIN * np.minimum(rival, 1.0)
+    return "denial" if "no " in free.heading and 2 * gains.sum() > len(gains) else ""
 
 
-def laser() -> None:
-    t, x = read("laser", "I")
-    found = trace(t[:1000], x[:1000])
-    show("laser, rolling starts over 750 to 1000", found, {f"{n} samples": n for n in (1, 7, 14)})
+def linear_errors(run: ep.Trajectory, n_fitted: int, horizons_s: np.ndarray) -> np.ndarray:
+    """Errors of a linear autoregression by least squares, its order by AIC, by horizon."""
+    z, m = np.hstack([run.states, run.inputs]), run.states.shape[1]
+    ends = np.rint(horizons_s / run.dt_s).astype(int)
+    std, rest = z[:n_fitted].std(axis=0), z[n_fitted:, :m].std(axis=0)
+    z = (z - z[:n_fitted].mean(axis=0)) / std
+    lags = [p for p in LAGS if p == 1 or 8 * p * z.shape[1] < n_fitted]
+
+    def row(w: np.ndarray, p: int) -> np.ndarray:  # inputs are known ahead
+        return np.hstack([np.ones((len(w), 1)), w[:, :p].reshape(len(w), -1), w[:, p, m:]])
+
+    fits, truth = [], z[lags[-1] : n_fitted, :m]
+    for p in lags:
+        rows = row(np.array([z[k - p : k + 1] for k in range(lags[-1], n_fitted)]), p)
+        coef, *_ = np.linalg.lstsq(rows, truth)
+        left = np.square(truth - rows @ coef).mean(axis=0)
+        fits.append((len(rows) * np.log(left + 1e-20).sum() + 2 * coef.size, p, coef))
+    _, p, coef = min(fits, key=lambda fit: fit[0])
+    starts = np.unique(np.linspace(max(n_fitted, p), len(z) - ends[-1], DENSE).astype(int))
+    ahead = np.array([z[k - p : k + ends[-1]] for k in starts])
+    truth = ahead[:, p:, :m].copy()
+    for j in range(ends[-1]):
+        ahead[:, p + j, :m] = np.clip(row(ahead[:, j:], p) @ coef, -1e3, 1e3)
+    off = np.square((ahead[:, p:, :m] - truth) * std[:m] / rest).mean(axis=(0, 2))
+    bins = np.searchsorted(ends, np.arange(1, ends[-1] + 1))
+    return np.asarray(np.sqrt(np.bincount(bins, off) / np.bincount(bins)))
 
 
-def electrochemical() -> None:
-    t, x = read("electrochemical", "I")
-    horizons = {f"{n} samples": float(n) for n in (5, 17, 35)}
-    show("electrochemical oscillator", trace(t, x), horizons)
-
-
-def hallthruster() -> None:
-    for case in (3, 2):
-        t, x = read(f"hallthruster_landmark_{case}", "I_d")
-        found = trace(t, x)
-        period_s = 1.0 / 9.7e3
-        show(f"HallThruster.jl, case {case}", found, {"1 period": period_s, "2": 2 * period_s})
-
-
-def pendulum() -> None:
-    run = ep.data.pendulum_swing()
-    more = (f"held_out={1.0 - 3.6 / 5.5}", f"tried=[{DRY_FRICTION}]")
-    found = trace(run.t, run.states[:, 0], *more)
-    show("pendulum, dry friction", found, {"0.1 s": 0.1, "0.4 s": 0.4})
-
-
-def populations() -> None:
-    """Hare and lynx over 14 of 21 years, Gause over 12 of 18 days, their terms named."""
-    for run, n_fitted in ((ep.data.hare_lynx(), 14), (ep.data.gause(), 12)):
-        first, second = run.state_names
-        both = f"{first}*{second}"
-        library = ep.polynomial(run.names).only({first: (first, both), second: (second, both)})
-        found = ep.discover(run.window(0, n_fitted), library)
-        skill = ep.model.forecast_skill(found.model, run, n_fitted=n_fitted)
-        print(f"\n{run.label}\n{found.model.text()}\n  {found.note}")
-        print(f"  {skill.text}; one step ahead {skill.at(run.dt_s)}")
-        print(f"  {text_of_bands(skill.coverage_90)}", flush=True)
+def intervals_hold(model: ep.SparseModel, law: Mapping[str, Any]) -> list[bool] | None:
+    """Which intervals hold the law's coefficients; None if the terms are not the law's."""
+    if any(set(model.terms(state)) != set(law[state]) for state in law):
+        return None
+    pairs = [(law[s][term], ends) for s in law for term, ends in model.intervals(s).items()]
+    return [low <= value <= high for value, (low, high) in pairs if low < high]  # not known ones
 
 
 def process_noise() -> None:
     """Laws whose states have process noise: supports that are right, intervals that hold."""
     for system in (ep.systems.van_der_pol(), ep.lorenz()):
-        right = held = n = 0
+        truth, right, inside = system.model, 0, list[bool]()
+        library = ep.polynomial(truth.states, degree=int(truth.library.degrees.max()))
         for seed in range(N_MOVED):
-            found = ep.discover(moved(system, PROCESS, seed), library_of(system))
-            own, truth = found.model, system.model
-            if found.lack_of_fit or any(
-                set(own.terms(s)) != set(truth.terms(s)) for s in truth.states
-            ):
-                continue
-            right += 1
-            for state in truth.states:
-                inside = [
-                    low <= truth.terms(state)[term] <= high
-                    for term, (low, high) in own.intervals(state).items()
-                ]
-                held, n = held + sum(inside), n + len(inside)
-        print(
-            f"{system.name}, process noise of {100 * PROCESS:.0f} % of RMS in a period: {right} of "
-            f"{N_MOVED} right, {held} of {n} intervals hold",
-            flush=True,
-        )
+            found = ep.discover(moved(system, PROCESS_NOISE, seed), library)
+            held = intervals_hold(found.model, {s: truth.terms(s) for s in truth.states})
+            if held is not None and not found.lack_of_fit:
+                right, inside = right + 1, inside + held
+        print(f"{system.name}, process noise of {PROCESS_NOISE:.0%} of RMS in a period: {right} of "
+              f"{N_MOVED} right, {sum(inside)} of {len(inside)} intervals hold")  # fmt: skip
 
 
 def moved(system: ep.systems.System, fraction: float, seed: int) -> ep.Trajectory:
@@ -184,39 +221,24 @@ def moved(system: ep.systems.System, fraction: float, seed: int) -> ep.Trajector
     return ep.Trajectory(clean.t, samples, clean.state_names)
 
 
-def library_of(system: ep.systems.System) -> ep.Library:
-    """All products up to the degree of the law, two at least."""
-    degree = max(2, int(system.model.library.degrees.max()))
-    return ep.polynomial(system.model.states, degree=degree)
-
-
 # Laws as one measured state shows them, by x' = v or x' = x*g: what is not known of them.
+LORENZ_OF_X = {
+    "v": {"v": -11.0, "x*h": 1.0},
+    "h": {"1": 720.0, "h": -8.0 / 3.0, "x^2": -10.0, "x*v": -1.0},
+}
+PREY = {"g": {"1": 2.0 / 9.0, "x": -2.0 / 3.0, "g": -1.0 / 3.0, "x*g": 1.0}}
+PREDATORS = {"g": {"1": 2.0 / 9.0, "y": -1.0 / 3.0, "g": 2.0 / 3.0, "y*g": -1.0}}
 SHOWN_LAWS: dict[str, tuple[ep.systems.System, str, dict[str, dict[str, float]]]] = {
-    "x of Lorenz": (
-        ep.lorenz(),
-        "x",
-        {
-            "v": {"v": -11.0, "x*h": 1.0},
-            "h": {"1": 720.0, "h": -8.0 / 3.0, "x^2": -10.0, "x*v": -1.0},
-        },
-    ),
-    "prey of Lotka-Volterra": (
-        ep.lotka_volterra(),
-        "x",
-        {"g": {"1": 2.0 / 9.0, "x": -2.0 / 3.0, "g": -1.0 / 3.0, "x*g": 1.0}},
-    ),
-    "predators of Lotka-Volterra": (
-        ep.lotka_volterra(),
-        "y",
-        {"g": {"1": 2.0 / 9.0, "y": -1.0 / 3.0, "g": 2.0 / 3.0, "y*g": -1.0}},
-    ),
+    "x of Lorenz": (ep.lorenz(), "x", LORENZ_OF_X),
+    "prey of Lotka-Volterra": (ep.lotka_volterra(), "x", PREY),
+    "predators of Lotka-Volterra": (ep.lotka_volterra(), "y", PREDATORS),
 }
 
 
 def hidden() -> None:
     """One measured state, the others hidden: laws found, and forecasts over the next cycles."""
     for words, (system, name, law) in SHOWN_LAWS.items():
-        right, nearer, inside, held, cpu_s = 0, 0, [], [], []
+        right, nearer, inside, held, cpu_s = 0, 0, list[bool](), [], []
         n = round(system.duration_s * system.rate_Hz)
         longer = replace(system, duration_s=1.6 * system.duration_s)
         for seed in range(N_DRAWS):
@@ -225,27 +247,16 @@ def hidden() -> None:
             begin_s = time.process_time()
             found = ep.discover(run.window(0, n), hidden=list(law))
             cpu_s.append(time.process_time() - begin_s)
-            if all(set(found.model.terms(s)) == set(terms) for s, terms in law.items()):
-                right += 1
-                inside += [
-                    low <= law[state][term] <= high
-                    for state in law
-                    for term, (low, high) in found.model.intervals(state).items()
-                    if low < high  # the others set the scale of a hidden state
-                ]
-            cycle_s = 1.0 / crossing_frequency(run.t, run.states[:, 0])
-            skill = ep.model.forecast_skill(
-                found.model, run, n_fitted=n, horizon_s=N_CYCLES * cycle_s
-            )
+            if (intervals := intervals_hold(found.model, law)) is not None:
+                right, inside = right + 1, inside + intervals
+            ahead_s = N_CYCLES / crossing_frequency(run.t, run.states[:, 0])
+            skill = ep.model.forecast_skill(found.model, run, n_fitted=n, horizon_s=ahead_s)
             nearer += bool(np.mean(skill.nrmse["model"]) < np.mean(skill.nrmse["autoregression"]))
             held.append(skill.coverage_90)
-        print(
-            f"{words}, 5 % noise: law right in {right} of {N_DRAWS}, {sum(inside)} of "
-            f"{len(inside)} intervals hold; nearer than the autoregression over {N_CYCLES} cycles "
-            f"in {nearer}, bands of 90 % hold {100 * np.mean(held):.1f} % ({100 * min(held):.0f} "
-            f"to {100 * max(held):.0f}); a search takes {np.median(cpu_s):.2g} CPU-s",
-            flush=True,
-        )
+        print(f"{words}, 5 % noise: law right in {right} of {N_DRAWS}, {sum(inside)} of "
+              f"{len(inside)} intervals hold; nearer than the autoregression over {N_CYCLES} "
+              f"cycles in {nearer}, bands of 90 % hold {np.mean(held):.1%} ({min(held):.0%} to "
+              f"{max(held):.0%}); a search takes {np.median(cpu_s):.2g} CPU-s")  # fmt: skip
     for voltage, flow in POINTS:
         neutrals(voltage, flow)
 
@@ -260,16 +271,14 @@ def offset() -> None:
             x = run.columns([name])
             signal = ep.signals.prepare_signal(ep.Trajectory(run.t, x - x.mean(), [name]))
             try:
-                value, low, high = fit_offset(signal, 2, ep.TrajectorySearch())
+                value, low, high = one_signal.fit_offset(signal, 2, ep.TrajectorySearch())
             except ValueError:
                 continue
             errors.append(abs(value / x.mean() - 1.0))
             held += low < x.mean() < high
         print(
-            f"mean of {name}, {100 * noise:.0f} % noise: found in {len(errors)} of {N_DRAWS}, off "
-            f"by {100 * np.median(errors):.2g} % ({100 * max(errors):.2g} at most), {held} "
-            "intervals hold",
-            flush=True,
+            f"mean of {name}, {noise:.0%} noise: found in {len(errors)} of {N_DRAWS}, off by "
+            f"{np.median(errors):.2%} ({max(errors):.2%} at most), {held} intervals hold"
         )
 
 
@@ -284,26 +293,15 @@ def neutrals(voltage: float, flow: float) -> None:
     states = ep.model.estimate_states(found.model, run)
     free = ep.evaluate(found.model, states.window(n, run.n_samples))
     alike = np.corrcoef(states.columns(["g"])[n:, 0], both.columns(["n_n"])[n:, 0])[0, 1]
-    print(
-        f"{voltage:g} V, {flow:g} mg/s: {free.status}, frequency off by {100 * free.f_error:.2f} "
-        f"%, correlation of the hidden state with n_n {alike:.3f}; "
-        f"{'a lack of fit' if found.lack_of_fit else 'fits'}: {found.model.text()}",
-        flush=True,
-    )
+    print(f"{voltage:g} V, {flow:g} mg/s: {free.status}, frequency off by {free.f_error:.2%}, "
+          f"correlation of the hidden state with n_n {alike:.3f}; "
+          f"{'a lack of fit' if found.lack_of_fit else 'fits'}: {found.model.text()}")  # fmt: skip
 
 
-TABLES = {each.__name__: each for each in (
-    laser, electrochemical, hallthruster, pendulum, populations, process_noise, hidden, offset,
-)}  # fmt: skip
-
-
-def main(names: Sequence[str]) -> None:
-    unknown = set(names) - set(TABLES)
-    if unknown:
-        raise SystemExit(f"tables are {', '.join(TABLES)}, got {', '.join(sorted(unknown))}")
-    for name in names or TABLES:
-        TABLES[name]()
+TABLES: dict[str, Callable[[], None]] = {name: partial(show, name) for name in RECORDS}
+TABLES |= {each.__name__: each for each in (headings, process_noise, hidden, offset)}
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    for name in sys.argv[1:] or TABLES:
+        TABLES[name]()
