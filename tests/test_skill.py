@@ -39,7 +39,7 @@ def test_a_gain_at_all_horizons_is_reported() -> None:
 def test_a_gain_is_reported_from_the_horizon_where_it_begins_to_where_it_ends() -> None:
     grows = np.where(np.arange(N_HORIZONS) < 20, 0.1, 0.6)
     found = skill(model=errors(grows), autoregression=errors(0.3, seed=1))
-    assert found.text == "better than an autoregression up to 1 periods"
+    assert found.text == "better than an autoregression up to 1 period"
     later = skill(model=errors(grows[::-1]), autoregression=errors(0.3, seed=1))
     assert later.text == "better than an autoregression from 1 to 2 periods"
     expected = "Least error: the autoregression up to 1, the model up to 2 periods."

@@ -50,6 +50,7 @@ PERIODS_AHEAD = 4.0  # longest horizon
 NEARER = 0.9  # fraction of the model's error below which a baseline is clearly nearer
 FEWEST = 0.1  # fraction of the horizons from which a span that begins later counts: many are tried
 EARLY = 0.25  # periods, over which a forecast must not be worse than the last sample or the mean
+TINY = 1e-12  # of the variance: rounding
 MODEL, MEAN = "model", "mean"
 WORDS = {
     MODEL: "the model",
@@ -171,33 +172,31 @@ class ForecastSkill:
         if span is None:
             return None
         first, last = span
-        begin = float(self.horizons_s[first - 1]) if first else 0.0
-        return begin / self.unit_s, float(self.horizons_s[last]) / self.unit_s
+        return (self._ahead(first - 1) if first else 0.0), self._ahead(last)
 
     def _span(self, span: tuple[int, int]) -> str:
-        """`from 0.3 to 4 periods`, or `up to 4 periods`."""
+        """`from 0.3 to 4 periods`, or `up to 1 period`."""
         begin, end = self._in_units(span) or (0.0, 0.0)
-        return (
-            f"from {begin:.2g} to {end:.2g} {self.unit}"
-            if begin
-            else f"up to {end:.2g} {self.unit}"
-        )
+        unit = self.unit.removesuffix("s") if end == 1.0 else self.unit
+        return f"from {begin:.2g} to {end:.2g} {unit}" if begin else f"up to {end:.2g} {unit}"
 
     @property
     def veto(self) -> str:
         """What forecasts the first horizons better than the model; empty if nothing simple does.
 
         It is the last sample or the mean of the record, over the first quarter of a period, or a
-        sixteenth of all horizons, by more than chance makes in a case of twenty.
+        sixteenth of all horizons, by more than chance makes in a case of twenty. Logarithms of the
+        errors are compared, so that starts where all is easy to foresee count as much.
         """
         early = self.horizons_s <= EARLY * self.period_s
         early |= np.arange(len(early)) < max(1, len(early) // 16)
         own, last = self.squared[MODEL][:, early].mean(axis=1), int(np.flatnonzero(early)[-1])
         rivals = {
-            "the last sample": self.squared[PERSISTENCE][:, early].mean(axis=1),
+            "the last sample": np.maximum(self.squared[PERSISTENCE][:, early].mean(axis=1), TINY),
             "the mean": np.ones(len(own)),
         }
-        lost = [name for name, each in rivals.items() if self._exceeds(own - each, last, SURE)]
+        loss = {name: np.log(np.maximum(own, TINY) / each) for name, each in rivals.items()}
+        lost = [name for name, each in loss.items() if self._exceeds(each, last, SURE)]
         return lost[0] if lost else ""
 
     @property
@@ -213,24 +212,25 @@ class ForecastSkill:
 
     @property
     def nearest_text(self) -> str:
-        """Which forecast errs least, by ranges of horizons, in a sentence.
+        """Which forecast errs least, by ranges of a tenth of the horizons, in a sentence.
 
-        A change of less than a tenth of the error, or for less than a tenth of the horizons, is
-        passed over.
+        A change of less than a tenth of the error is passed over.
         """
-        names = [*self.nrmse, MEAN]
-        errors = np.array([*self.nrmse.values(), np.ones(len(self.horizons_s))])
-        best: list[int] = []
-        for column in errors.T:
-            least = int(column.argmin())
-            kept = best and column[least] > NEARER * column[best[-1]]
+        parts = np.array_split(np.arange(len(self.horizons_s)), min(10, len(self.horizons_s)))
+        errors = {name: [each[part].mean() for part in parts] for name, each in self.nrmse.items()}
+        errors[MEAN] = [1.0] * len(parts)
+        best: list[str] = []
+        for k in range(len(parts)):
+            least = min(errors, key=lambda name: errors[name][k])
+            kept = best and errors[least][k] > NEARER * errors[best[-1]][k]
             best.append(best[-1] if kept else least)
-        ends = [k for k in range(len(best)) if k + 1 == len(best) or best[k] != best[k + 1]]
-        parts = [
-            f"{WORDS[names[best[k]]]} up to {float(self.horizons_s[k]) / self.unit_s:.2g}"
-            for k in ends
-        ]
-        return f"Least error: {', '.join(parts)} {self.unit}."
+        ends = [k for k, name in enumerate(best) if best[k + 1 : k + 2] != [name]]
+        spans = [f"{WORDS[best[k]]} up to {self._ahead(int(parts[k][-1])):.2g}" for k in ends]
+        return f"Least error: {', '.join(spans)} {self.unit}."
+
+    def _ahead(self, horizon: int) -> float:
+        """A horizon in periods, or in samples."""
+        return float(self.horizons_s[horizon]) / self.unit_s
 
     def at(self, horizon_s: float) -> dict[str, float]:
         """Errors at the horizon nearest to the given one, by who forecasts."""
