@@ -11,9 +11,12 @@ from matplotlib.figure import Figure
 
 from ep2sindy.figures import style
 from ep2sindy.figures.style import GREY, SIGN, TITLE
+from ep2sindy.model.comparison import Status
 
 # Status -> marker, the best first; any other run has no cycle.
-MARKERS = {"sustained": "o", "wrong frequency": "D", "wrong cycle": "s"}
+WEAK = "its cycle does not attract"
+MARKERS = {"sustained": "o", WEAK: "^", "wrong frequency": "D", "wrong cycle": "s"}
+WEAKLY = [str(each) for each in (Status.NOT_TOLD, Status.NEUTRAL, Status.REPELLING)]
 OTHER = "no cycle: decays, diverges, turns negative"
 NORM = LogNorm(0.01, 1.0)  # of the amplitude's error
 
@@ -28,9 +31,10 @@ def sustained_figure(rows: pd.DataFrame, *, labels: Mapping[str, str]) -> Figure
     structures = list(rows["structure"].unique())
     width, height = 1.6 / len(ways) + 0.5 * len(points), 1.9 + 0.3 * len(structures)
     figure, axes = style.make_row(len(ways), width=width, height=height)
+    status = rows["status"].replace(dict.fromkeys(WEAKLY, WEAK))
     places = rows.assign(
         x=rows["point"].map(points.index), y=rows["structure"].map(structures.index),
-        kind=rows["status"].where(rows["status"].isin([*MARKERS]), OTHER),
+        kind=status.where(status.isin([*MARKERS]), OTHER),
     )  # fmt: skip
     look: dict[str, Any] = {"cmap": "viridis_r", "norm": NORM, "edgecolors": SIGN, "lw": 0.5}
     for ax, way in zip(axes, ways, strict=True):
