@@ -77,7 +77,8 @@ def law_at_rest(whole: sustained.Record) -> tuple[complex, Balance]:
     """The law refined on three quarters: eigenvalue of its rest point, and its balance there."""
     fitted, assessed = sustained.parts(whole.run, "last")
     model = sustained.law(fitted, whole, seed=0).model
-    rest = ep.evaluate(model, assessed, initial=sustained.start_of(assessed, model)).rest
+    run = ep.evaluate(model, assessed, initial=sustained.start_of(assessed, model))
+    rest = sustained.rest_of(run)
     assert rest is not None
     moved, leave = [
         {term: sign * model.terms(IONS)[term] for term in terms}

@@ -28,6 +28,7 @@ import ep2sindy as ep
 from benchmarks.source import measured_sets, named_set
 from ep2sindy.data.zones import ZoneAverage, side_by_side
 from ep2sindy.library.relations import Constraint
+from ep2sindy.model.fixed_point import RestPoint
 from ep2sindy.regression.searches import Search
 from ep2sindy.studies.processes import ComparedProcess, Zones, compared_processes, fit_roles
 from ep2sindy.studies.sustained import start_of
@@ -247,7 +248,7 @@ def case(
     multiplier = fraction = float("nan")
     if run.holds and (cycle := run.cycle) is not None:
         multiplier = float(np.abs(cycle.multipliers[1:]).max())
-        fraction = run.basin_stability
+        fraction = ep.model.basin_stability(model, cycle)
     confirmed = not run.holds or lives_on(model, assessed)
     held = found.constraint
     n_free = int(np.count_nonzero(model.coef)) if held is None else len(held.free)
@@ -380,11 +381,16 @@ def models_of_its_size(whole: Record) -> list[ep.model.Evaluation]:
     return [run for run in runs if run.holds]
 
 
+def rest_of(run: ep.model.Evaluation) -> RestPoint | None:
+    """The rest point of a model where neither density is zero."""
+    return next((rest for rest in run.rest_points if (rest.state > 0.0).all()), None)
+
+
 def print_growth() -> None:
     """Six operating points: where the models of one size rest, and what they say of growth."""
     print("\nsustained models of the selected one's size: growth and frequency where they rest")
     for label in POINTS:
-        rests = [run.rest for run in models_of_its_size(record(label))]
+        rests = [rest_of(run) for run in models_of_its_size(record(label))]
         growth, f_kHz = np.transpose(
             [(rest.growth_per_s, 1e-3 * rest.frequency_Hz) for rest in rests if rest is not None]
         )

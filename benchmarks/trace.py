@@ -68,7 +68,7 @@ def row(clean: Trajectory, measured: Trajectory, seed: int) -> dict[str, object]
         "amplitude": run.amplitude_ratio[NAME],
         "waveform": run.waveform_error[NAME],
         "terms": len(model.terms("g")),
-        "reaching": run.basin_stability,
+        "reaching": ep.model.basin_stability(model, run.cycle) if run.cycle else float("nan"),
         "g'": ", ".join(model.terms("g")),
     }
 

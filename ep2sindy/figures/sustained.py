@@ -31,10 +31,10 @@ def sustained_figure(rows: pd.DataFrame, *, labels: Mapping[str, str]) -> Figure
     structures = list(rows["structure"].unique())
     width, height = 1.6 / len(ways) + 0.5 * len(points), 1.9 + 0.3 * len(structures)
     figure, axes = style.make_row(len(ways), width=width, height=height)
-    status = rows["status"].replace(dict.fromkeys(WEAKLY, WEAK))
+    marked = rows["status"].replace(dict.fromkeys(WEAKLY, WEAK))
     places = rows.assign(
         x=rows["point"].map(points.index), y=rows["structure"].map(structures.index),
-        kind=status.where(status.isin([*MARKERS]), OTHER),
+        kind=marked.where(marked.isin([*MARKERS]), OTHER),
     )  # fmt: skip
     look: dict[str, Any] = {"cmap": "viridis_r", "norm": NORM, "edgecolors": SIGN, "lw": 0.5}
     for ax, way in zip(axes, ways, strict=True):

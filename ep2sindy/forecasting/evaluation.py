@@ -28,13 +28,12 @@ from ep2sindy.model.comparison import (
     columns_of,
     record_of,
 )
-from ep2sindy.model.fixed_point import UNDETERMINED, RestPoint, rest_point, rest_points
+from ep2sindy.model.fixed_point import UNDETERMINED, RestPoint, rest_points
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.restarts import OneStep, one_step
 from ep2sindy.model.rollout import Rollout
 from ep2sindy.model.stability import (
     LimitCycle,
-    basin_stability,
     end_of_long_run,
     limit_cycle,
     multiplier_error,
@@ -261,11 +260,6 @@ class Evaluation:
         return list(Status).index(self.status)
 
     @cached_property
-    def excursion(self) -> float:
-        """Largest distance from the data's mean, in standard deviations."""
-        return self.compared.excursion(self.rollout.states)
-
-    @cached_property
     def frequency_Hz(self) -> Mapping[str, float]:
         """By state; NaN if the run diverged or the state decayed."""
         found = {}
@@ -354,20 +348,6 @@ class Evaluation:
     def multiplier(self) -> float:
         """Largest modulus of the nontrivial Floquet multipliers; NaN without a cycle."""
         return float("nan") if self.cycle is None else self.cycle.largest_multiplier
-
-    @cached_property
-    def basin_stability(self) -> float:
-        """Fraction of the starts around the cycle that reach it; NaN without a cycle."""
-        return float("nan") if self.cycle is None else basin_stability(self.model, self.cycle)
-
-    @cached_property
-    def rest(self) -> RestPoint | None:
-        """Where the model rests inside its cycle; None without a cycle, or if it does not."""
-        if self.cycle is None:
-            return None
-        states = self.cycle.states
-        scale, positive = states.std(axis=0), states.min(axis=0) > 0.0
-        return rest_point(self.model, states.mean(axis=0), scale, positive)
 
     @cached_property
     def rest_points(self) -> tuple[RestPoint, ...]:

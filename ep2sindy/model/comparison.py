@@ -171,9 +171,6 @@ class ComparedRecord:
         std = self.states.std(axis=0) if self.cycle is None else self.cycle.std
         object.__setattr__(self, "std", zero_to_one(std))
 
-    def excursion(self, states: Float[np.ndarray, "_ n_states"]) -> float:
-        return float((np.abs(states - self.states.mean(axis=0)) / self.std).max())
-
     def similarity(
         self, states: Float[np.ndarray, "_ n_states"], bounds: FreeRunBounds
     ) -> Comparison:

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
-from scipy.optimize import least_squares
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.forecasting.evaluation import Evaluation
@@ -17,6 +16,7 @@ from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Constraint
 from ep2sindy.library.roles import Role
 from ep2sindy.model.model import SparseModel
+from ep2sindy.model.restarts import Restarts
 from ep2sindy.refinement.windows import dominant_window
 from ep2sindy.regression.constrained import constrained_fit, rows_r2
 from ep2sindy.regression.formulations import Weak
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from ep2sindy.refinement.refine import Refinement
 
 BALANCE = "balance"  # the form of a fit of every process to the recorded balance
-DIVERGED = 10.0  # residual, in std, at samples that a run diverges before
 STARTED = "_started"  # ends the names of what concerns runs from a fitted start
 
 
@@ -193,21 +192,10 @@ FITTED: Metrics[Fitted] = [
 
 
 def fitted_start(model: SparseModel, run: Trajectory) -> Float[np.ndarray, " n_states"]:
-    """Initial state whose trajectory is closest to the first one and a half periods of data.
-
-    Distances are in standard deviations of the data. The search starts from the first sample.
-    """
+    """Initial state whose trajectory is closest to the first one and a half periods of data."""
     n_samples = min(dominant_window([run], model.states), run.n_samples)
-    data = run.window(0, n_samples).columns(model.states)
-    std = run.columns(model.states).std(axis=0)
-
-    def residual(start: np.ndarray) -> np.ndarray:
-        rollout = model.rollout(run, n_samples=n_samples, initial=start * std, rtol=1e-6)
-        strayed = np.full(data.shape, DIVERGED)
-        strayed[: len(rollout.t)] = (rollout.states - data[: len(rollout.t)]) / std
-        return strayed.ravel()
-
-    return least_squares(residual, data[0] / std, diff_step=1e-4).x * std
+    (start,) = Restarts(model, run).fitted(np.zeros(1, dtype=np.int64), n_samples - 1)
+    return start
 
 
 def wrong_signs(model: SparseModel, held_to: Constraint | None, record: RecordParts) -> list[str]:

@@ -201,12 +201,10 @@ EVALUATION: Metrics[Evaluation] = [
     Metric("periods", lambda run: run.periods, View.SHOWN, "periods in phase", "{:.0f}"),
     Metric("status", lambda run: run.text, View.SHOWN),
 ]
-# Its cycle and where it rests, which take many runs: of models that are to sustain their
-# oscillation.
+# Its cycle, which takes many runs: of models that are to sustain their oscillation.
 CYCLE: Metrics[Evaluation] = [
     Metric("stability", lambda run: run.cycle and run.cycle.stability),
     Metric("multiplier", lambda run: run.multiplier, COMPARED),
-    Metric("rest", lambda run: _rest(run)),
 ]
 EVALUATED = (
     "Amplitude: standard deviation over the data's. Waveform: RMS difference of one period, in "
@@ -224,10 +222,3 @@ def _record_frequency_Hz(run: Evaluation) -> dict[str, float]:
     columns = run.record.columns(run.model.states).T
     found = [dominant_frequency(run.record.t, column) for column in columns]
     return dict(zip(run.model.states, found, strict=True))
-
-
-def _rest(run: Evaluation) -> dict[str, float] | None:
-    """Where the model rests inside its cycle, by state; None if it does not."""
-    if run.rest is None:
-        return None
-    return dict(zip(run.model.states, run.rest.state.tolist(), strict=True))
