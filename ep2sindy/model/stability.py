@@ -48,8 +48,9 @@ EXACT, NO_DIRECTION = 1e-6, 1e-10
 N_END, N_SAMPLES_AT_END, LONG_RTOL = 20, 64, 1e-8
 
 # A run is given up as diverged when it is BLOW_UP times as far from the cycle's mean as the
-# farthest start, and as stuck after PATIENCE times the steps that the cycle itself takes.
-BLOW_UP, PATIENCE = 30.0, 4.0
+# farthest start, and as stuck after PATIENCE times the steps that the cycle itself takes, or after
+# MOST_STEPS, which on a stiff cycle take a second.
+BLOW_UP, PATIENCE, MOST_STEPS = 30.0, 4.0, 1e6
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,7 +221,7 @@ def basin_stability(
     -----
     Every start has its own time step: a 64th of the period, or one over the norm of the Jacobian if
     that is less. A run is given up when it is 30 times as far from the cycle's mean as the farthest
-    start, or after four times the steps that the cycle takes.
+    start, or after four times the steps that the cycle takes, a million at most.
 
     Source: Menck, Heitzig, Marwan & Kurths 2013, doi:10.1038/nphys2516, for the measure.
     """
@@ -231,7 +232,8 @@ def basin_stability(
     curve = cycle.states / scale
     y = starts_around(cycle.states, n_starts, spread) / scale
     per_period = float(np.mean(1.0 / _steps(field, curve)))
-    on_cycle = _on_cycle(field, y, curve, n_periods, round(PATIENCE * n_periods * per_period))
+    n_steps = round(min(PATIENCE * n_periods * per_period, MOST_STEPS))
+    on_cycle = _on_cycle(field, y, curve, n_periods, n_steps)
     return float(on_cycle) / n_starts
 
 
