@@ -429,15 +429,7 @@ class SparseModel:
 
     def to_json(self) -> str:
         """JSON text of the whole model; floats in their shortest exact form."""
-        return model_text(
-            self.library,
-            {state: self.terms(state) for state in self.states},
-            units=self.units,
-            provenance=self.provenance,
-            covariance=self.covariance,
-            clock=self.clock,
-            courses=self.courses,
-        )
+        return model_text(self, self.provenance)
 
     @staticmethod
     def from_json(text: str) -> SparseModel:
