@@ -21,9 +21,9 @@ from ep2sindy.library.library import Library
 from ep2sindy.library.units import SECONDS, Clock
 from ep2sindy.model.display import model_html, model_lines
 from ep2sindy.model.draws import draw_coef, draw_runs
-from ep2sindy.model.inputs import check_courses, curve_through, driven, inputs_at_samples
+from ep2sindy.model.inputs import check_courses, driven, inputs_at_samples
 from ep2sindy.model.restarts import one_step
-from ep2sindy.model.rollout import Rollout, check_start, integrate, simulate
+from ep2sindy.model.rollout import Rollout, check_start, simulate
 from ep2sindy.model.scores import r2
 from ep2sindy.model.storage import model_text, read_model, read_stored
 from ep2sindy.model.vector_field import VectorField
@@ -230,17 +230,16 @@ class SparseModel:
         run = trajectory_of(trajectory)
         window = run.window(start, run.n_samples if n_samples is None else start + n_samples)
         data, samples = window.columns(self.states), window.columns(self.inputs)
-        found = integrate(
+        found = simulate(
             self,
             window.t,
             data[0] if initial is None else initial,
-            drive=curve_through(window.t, samples, list(map(self.courses.get, self.inputs))),
-            samples=samples,
-            scale=np.abs(data).max(axis=0),
+            samples,
             blow_up=blow_up,
-            bound="the data's largest value",
             rtol=rtol,
             limit_s=limit_s,
+            reach=np.abs(data).max(axis=0),
+            bound="the data's largest value",
         )
         return replace(found, clock=run.clock)
 
