@@ -51,7 +51,7 @@ def precompile() -> None:
         return
     say_once(ANNOUNCEMENT)
     with suppress(OSError):  # on a full disk, the next run repeats this half minute
-        _compile_all()
+        collect(Loky(), _compile, [*PARTS], Bars().stage(len(PARTS), "part"))
         stamp.mkdir()
 
 
@@ -65,11 +65,6 @@ def _stamp() -> Path:
 
     versions = f"{digest(sources())}{numba.__version__}{sys.version}{get_host_cpu_name()}"
     return cache_folder("kernels", f"warm_{sha256(versions.encode()).hexdigest()[:16]}")
-
-
-def _compile_all() -> None:
-    """Run all parts, side by side where there are cores for them."""
-    collect(Loky(), _compile, [*PARTS], Bars().stage(len(PARTS), "part"))
 
 
 def _compile(part: str) -> None:
