@@ -423,18 +423,6 @@ STILL = 1e-3
 N_SAMPLES = 200
 
 
-def _run(
-    model: SparseModel, start: Float[np.ndarray, " n_states"], *, period_s: float, n_periods: float
-) -> Float[np.ndarray, "samples n_states"] | None:
-    """States of a free run from a start, N_SAMPLES per period; None if they diverge."""
-    # A state that starts near zero has at least the size that its rate gives it in a period.
-    moved = np.abs(model.derivative(start, np.empty(0))) * period_s
-    size = np.maximum(start_scale(model, start, np.empty(0), period_s), moved)
-    t = period_s * np.linspace(0.0, n_periods, round(N_SAMPLES * n_periods) + 1)
-    run = simulate(model, t, start, None, blow_up=START_BLOW_UP, rtol=START_RTOL, reach=size)
-    return None if run.diverged else run.states
-
-
 def _find_orbit(
     model: SparseModel,
     start: Float[np.ndarray, " n_states"],
@@ -448,10 +436,15 @@ def _find_orbit(
     The closest return of the run starts Newton's method. None if the run diverges, or if Newton's
     method does not close the orbit, or ends on a fixed point.
     """
-    run = _run(model, start, period_s=period_s, n_periods=n_settling + RETURNS[1])
-    if run is None:
+    # A state that starts near zero has at least the size that its rate gives it in a period.
+    moved = np.abs(model.derivative(start, np.empty(0))) * period_s
+    size = np.maximum(start_scale(model, start, np.empty(0), period_s), moved)
+    n_periods = n_settling + RETURNS[1]
+    t = period_s * np.linspace(0.0, n_periods, round(N_SAMPLES * n_periods) + 1)
+    free = simulate(model, t, start, None, blow_up=START_BLOW_UP, rtol=START_RTOL, reach=size)
+    if free.diverged:
         return None
-    run = run[n_settling * N_SAMPLES :]
+    run = free.states[n_settling * N_SAMPLES :]
     scale = deviations(run)
     field = model.field.scaled(scale, period_s)
     departing = Driven(field.with_perturbations())
