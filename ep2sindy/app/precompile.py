@@ -9,7 +9,6 @@ import argparse
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from functools import partial
 from hashlib import sha256
 from pathlib import Path
 
@@ -93,10 +92,10 @@ def _refinement() -> None:
     """Compile refinement, trial runs, and the simulator along the axis."""
     point, step_s = ep.thruster.OperatingPoint(300.0, 5.0), 1e-7
     for n_samples in (20, 60):  # in one piece, and in several pieces, which are slices
-        brief = partial(
-            ep.thruster.simulate, duration_s=n_samples * step_s, warm_up_s=0.0, sample_s=step_s
-        )
-        brief(ep.thruster.Thruster(), point, n_cells=20, progress=False)
+        ep.thruster.simulate(
+            ep.thruster.Thruster(), point, duration_s=n_samples * step_s, warm_up_s=0.0,
+            sample_s=step_s, n_cells=20, progress=False,
+        )  # fmt: skip
     system = ep.lotka_volterra()
     for step in (ep.refinement.RungeKutta(), ep.refinement.FusedRungeKutta()):
         method = ep.refinement.MultipleShooting(step=step)
@@ -109,9 +108,9 @@ def _refinement() -> None:
 
 def _plane() -> None:
     """Compile the (z, r) simulator."""
-    step_s = 1e-6
-    brief = partial(ep.thruster.simulate_2d, duration_s=20 * step_s, warm_up_s=0.0, sample_s=step_s)
-    brief(n_z=12, n_r=12, progress=False)
+    ep.thruster.simulate_2d(
+        duration_s=2e-5, warm_up_s=0.0, sample_s=1e-6, n_z=12, n_r=12, progress=False
+    )
 
 
 PARTS: Mapping[str, Callable[[], None]] = {
