@@ -225,7 +225,8 @@ class SparseModel:
         Raises
         ------
         ValueError
-            If the window lies outside the trajectory, or a variable is missing.
+            If the window lies outside the trajectory, a variable is missing, or the initial state
+            does not hold a finite number for each state.
         """
         run = trajectory_of(trajectory)
         window = run.window(start, run.n_samples if n_samples is None else start + n_samples)
@@ -233,7 +234,7 @@ class SparseModel:
         found = simulate(
             self,
             window.t,
-            data[0] if initial is None else initial,
+            data[0] if initial is None else check_start(self.states, initial, name="initial"),
             samples,
             blow_up=blow_up,
             rtol=rtol,
@@ -408,8 +409,7 @@ class SparseModel:
 
     def latex(self, *, digits: int = 3) -> str:
         """LaTeX `aligned` block with one equation per line."""
-        terms = {state: self.terms(state) for state in self.states}
-        return equations_latex(terms, digits=digits)
+        return equations_latex({state: self.terms(state) for state in self.states}, digits=digits)
 
     def __str__(self) -> str:
         """Equations with units and, where a covariance is known, 95 % intervals."""
