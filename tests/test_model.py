@@ -67,6 +67,8 @@ def test_rollout_of_a_window_starts_from_the_data() -> None:
     assert np.array_equal(rollout.t, run.t[50:90])
     assert rollout.states[0] == pytest.approx(run.states[50])
     assert np.abs(rollout.states - run.states[50:90]).max() < 1e-6
+    with pytest.raises(ValueError, match="initial must give a finite number for each of"):
+        model.rollout(run, initial=np.ones(7))
 
 
 def test_rollout_conserves_what_predator_and_prey_conserve() -> None:

@@ -9,7 +9,6 @@ import argparse
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from functools import partial
 from hashlib import sha256
 from pathlib import Path
 
@@ -51,7 +50,7 @@ def precompile() -> None:
         return
     say_once(ANNOUNCEMENT)
     with suppress(OSError):  # on a full disk, the next run repeats this half minute
-        _compile_all()
+        collect(Loky(), _compile, [*PARTS], Bars().stage(len(PARTS), "part"))
         stamp.mkdir()
 
 
@@ -65,11 +64,6 @@ def _stamp() -> Path:
 
     versions = f"{digest(sources())}{numba.__version__}{sys.version}{get_host_cpu_name()}"
     return cache_folder("kernels", f"warm_{sha256(versions.encode()).hexdigest()[:16]}")
-
-
-def _compile_all() -> None:
-    """Run all parts, side by side where there are cores for them."""
-    collect(Loky(), _compile, [*PARTS], Bars().stage(len(PARTS), "part"))
 
 
 def _compile(part: str) -> None:
@@ -98,10 +92,10 @@ def _refinement() -> None:
     """Compile refinement, trial runs, and the simulator along the axis."""
     point, step_s = ep.thruster.OperatingPoint(300.0, 5.0), 1e-7
     for n_samples in (20, 60):  # in one piece, and in several pieces, which are slices
-        brief = partial(
-            ep.thruster.simulate, duration_s=n_samples * step_s, warm_up_s=0.0, sample_s=step_s
-        )
-        brief(ep.thruster.Thruster(), point, n_cells=20, progress=False)
+        ep.thruster.simulate(
+            ep.thruster.Thruster(), point, duration_s=n_samples * step_s, warm_up_s=0.0,
+            sample_s=step_s, n_cells=20, progress=False,
+        )  # fmt: skip
     system = ep.lotka_volterra()
     for step in (ep.refinement.RungeKutta(), ep.refinement.FusedRungeKutta()):
         method = ep.refinement.MultipleShooting(step=step)
@@ -114,9 +108,9 @@ def _refinement() -> None:
 
 def _plane() -> None:
     """Compile the (z, r) simulator."""
-    step_s = 1e-6
-    brief = partial(ep.thruster.simulate_2d, duration_s=20 * step_s, warm_up_s=0.0, sample_s=step_s)
-    brief(n_z=12, n_r=12, progress=False)
+    ep.thruster.simulate_2d(
+        duration_s=2e-5, warm_up_s=0.0, sample_s=1e-6, n_z=12, n_r=12, progress=False
+    )
 
 
 PARTS: Mapping[str, Callable[[], None]] = {

@@ -21,21 +21,14 @@ class Ties(NamedTuple):
     leads: Int[np.ndarray, " free"]
 
 
-class Coefficients(NamedTuple):
-    """Equation and term of each coefficient in question. ties: None if all are free."""
-
-    equation: Int[np.ndarray, " coefficients"]
-    column: Int[np.ndarray, " coefficients"]
-    ties: Ties | None
-
-
 def coefficients_of(
     library: Library,
     states: Sequence[str],
     processes: Sequence[Process],
-) -> Coefficients:
-    """The coefficients of an estimation; see `scale_problem`.
+) -> tuple[Int[np.ndarray, " coefficients"], Int[np.ndarray, " coefficients"], Ties | None]:
+    """Equation and term of each coefficient of an estimation; see `scale_problem`.
 
+    Third is what ties them together; None if all are free.
     The terms of an equation are those that are known, or all that are not excluded; under roles,
     those that processes or known roles bring into it.
     """
@@ -62,4 +55,4 @@ def coefficients_of(
         C = np.array([[process.factors.get(at, 0.0) for process in processes] for at in named])
         fixed = np.array([roles.known.get(at, 0.0) for at in named])
         ties = Ties(C, fixed, np.argmax(C != 0.0, axis=0))
-    return Coefficients(equation, column, ties)
+    return equation, column, ties

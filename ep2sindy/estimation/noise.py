@@ -132,7 +132,8 @@ def noise_beside(fit: TrajectoryFit) -> Noise:
     samples, off = (problem.split(each) for each in (record.values, record.values - fit.path))
     # Slow residuals of a signal's size tell that the model ignores the signal.
     ignored = (memory > SLOW) & (std > LARGE * record.samples.std(axis=0))
-    lasts = _lasts_as_noise(unit, samples, off, std, memory, float(problem.n_samples))
+    shown = _shown_by_samples(samples, off, std, memory, float(problem.n_samples))
+    lasts = _forgets_as_noise(unit, memory, float(problem.n_samples)) & shown
     believed = shows & lasts & ~ignored & ~patterned
     std = np.maximum(std, np.where(hidden, 0.0, FLOOR))
     lasting = np.where(believed, memory, 0.0)
@@ -211,7 +212,8 @@ def are_noise(samples: Pieces, left: Pieces, n: float) -> StateMask:
     of these samples are independent.
     """
     std, memory = np.sqrt(np.mean(np.square(np.concatenate(left)), axis=0)), _memory(left)
-    lasts = _lasts_as_noise(left, samples, left, std, memory, n)
+    shown = _shown_by_samples(samples, left, std, memory, n)
+    lasts = _forgets_as_noise(left, memory, n) & shown
     return lasts | (memory <= SIGNIFICANT / np.sqrt(n)) | (std <= FLOOR)
 
 
@@ -371,23 +373,14 @@ def powers_of(states: BySample, degree: int) -> np.ndarray:
     return np.stack([scaled[:, list(each)].prod(axis=1) for each in islice(factors, most)], axis=1)
 
 
-def _lasts_as_noise(
-    unit: Pieces,
-    samples: Pieces,
-    left: Pieces,
-    std: ByState,
-    memory: ByState,
-    n: float,
-) -> StateMask:
-    """True where residuals are correlated as AR(1) noise of this size and memory would be.
+def _forgets_as_noise(unit: Pieces, memory: ByState, n: float) -> StateMask:
+    """True where the autocorrelation of residuals falls as fast as that of AR(1) noise.
 
-    Their autocorrelation falls as fast as that of such noise, which the samples show: the error of
-    a model on a signal with white noise stays correlated over longer lags. unit: the residuals,
-    over the shape of the noise.
+    The error of a model on a signal with white noise stays correlated over longer lags. unit: the
+    residuals, over the shape of the noise.
     """
     excess = autocorrelations(unit, LAGS) - memory ** np.array(LAGS)[:, None]
-    forgets = np.all(excess < LONGER / np.sqrt(n), axis=0)
-    return forgets & _shown_by_samples(samples, left, std, memory, n)
+    return np.all(excess < LONGER / np.sqrt(n), axis=0)
 
 
 def _shown_by_samples(

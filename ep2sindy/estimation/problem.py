@@ -374,14 +374,15 @@ def scale_problem(
     names, roles = [*states, *inputs], library.facts.roles
     whole = library.at_operating_point(point).with_known_terms(states)
     over = replace(whole.over(names), facts=whole.facts)
-    size = _rms(runs, names)
+    samples = np.concatenate([run.columns(names) for run in runs])
+    size = zero_to_one(np.sqrt(np.square(samples).mean(axis=0)))
     step_s = mean_step(*(run.t for run in runs))
     scaled, numbers = over.scaled(size)
     processes = roles.processes(library, states) if roles else []
     equation, column, ties = coefficients_of(over, states, processes)
     to_SI = size[equation] / (numbers[column] * step_s)
     fixed = np.isin(equation, [states.index(state) for state in library.facts.only])
-    problem = EstimationProblem(
+    return EstimationProblem(
         library=scaled,
         term_names=over.names,
         states=tuple(states),
@@ -402,13 +403,7 @@ def scale_problem(
         inputs=tuple(inputs),
         allowed_courses=tuple(allowed.values()),
         monitor=monitor or SearchMonitor(),
-    )
-    return problem.of(runs)
-
-
-def _rms(runs: Sequence[Trajectory], names: Sequence[str]) -> Float[np.ndarray, " variables"]:
-    samples = np.concatenate([run.columns(names) for run in runs])
-    return zero_to_one(np.sqrt(np.square(samples).mean(axis=0)))
+    ).of(runs)
 
 
 def _allow_courses(

@@ -179,7 +179,9 @@ class ComparedRecord:
         by_state = dict.fromkeys(("amplitude_ratio", "waveform_error"), nothing)
         if len(states) < len(self.t) or not np.isfinite(states).all():
             return Comparison(Status.DIVERGES, False, np.nan, by_state)
-        half = len(states) // 2 if self._is_long else 0
+        # Half of a record may be left out as a transient if the rest holds periods enough.
+        is_long = self.cycle is not None and self.repeats and self.cycle.n_periods >= LONG
+        half = len(states) // 2 if is_long else 0
         late = states[half:]
         by_state["amplitude_ratio"] = late.std(axis=0) / zero_to_one(self.states[half:].std(axis=0))
         if turns_negative(late, self.densities, self.std):
@@ -230,11 +232,6 @@ class ComparedRecord:
     def repeats(self) -> bool:
         """True if the record repeats one cycle; otherwise runs are compared by statistics first."""
         return self.cycle is not None and self.cycle.repeats
-
-    @property
-    def _is_long(self) -> bool:
-        """True if half of the record holds enough periods to compare."""
-        return self.repeats and self.cycle is not None and self.cycle.n_periods >= LONG
 
     def _is_alike(self, states: np.ndarray, bounds: FreeRunBounds) -> bool:
         """True if means and amplitudes are as near to the record's as those of its thirds are."""

@@ -73,8 +73,6 @@ def draw_runs(
     if len(t) < 2:  # of a run that ended at its start
         return starts[:, None][:, : len(t)]
     bound = BLOW_UP * zero_to_one(reach)
-    if drive is not None and not model.inputs:
-        drive = None
     variables = [*model.states, *model.inputs]
     centre = VectorField.of(model.library, variables, coef.mean(axis=0)[None])
     steps = _fine_enough(centre, starts.mean(axis=0), t, drive, bound)
@@ -97,10 +95,10 @@ def _fine_enough(
 ) -> WindowSteps:
     """Steps between the samples that follow the central run."""
     n, begin = 1, np.zeros(1, dtype=np.int64)
-    run = _runs(field, start[None], t, drive, begin, len(t), n, bound)[0]
+    run = runs_from(field, start[None], t, drive, begin, len(t), n, bound)[0]
     some = np.linspace(0, len(t) - 2, min(len(t) - 1, 40)).astype(np.int64)
     while n < MAX_SUBSTEPS:
-        finer = _runs(field, start[None], t, drive, begin, len(t), 2 * n, bound)[0]
+        finer = runs_from(field, start[None], t, drive, begin, len(t), 2 * n, bound)[0]
         off = step_error(field, finer[some], t, drive, some, n, bound) / zero_to_one(
             np.abs(run).max(axis=0)
         )
@@ -126,16 +124,20 @@ def step_error(
     A chaotic run leaves its neighbours: single steps, not whole runs, are compared.
     """
     coarse, fine = (
-        _runs(field, starts, t, drive, first, 2, n, bound)[:, 1]
+        runs_from(field, starts, t, drive, first, 2, n, bound)[:, 1]
         for n in (n_substeps, 2 * n_substeps)
     )
     return np.abs(coarse - fine)
 
 
-def _runs(
+def runs_from(
     field: VectorField, starts: np.ndarray, t: np.ndarray, drive: Curve | None,
     first: np.ndarray, n_samples: int, n_substeps: int, bound: np.ndarray,
-) -> np.ndarray:  # fmt: skip
+) -> Float[np.ndarray, "starts samples n_states"]:  # fmt: skip
+    """Runs of one model from a state (starts, n_states) at each of the samples `first` of t.
+
+    A run with a state beyond the bound, (n_states,), is NaN from there on.
+    """
     steps = WindowSteps.along(t, drive, first, n_samples, n_substeps)
     return run_many(field, starts[None], steps, centre=np.zeros(len(bound)), reach=bound)[0]
 

@@ -25,13 +25,12 @@ def inputs_at_samples(
 
     Raises ValueError for inputs that are missing, unknown, of another shape or not finite.
     """
+    if inputs is None:
+        inputs = {}
     if isinstance(inputs, Mapping):
         _check_names(names, inputs)
         columns = [_column(name, inputs[name], shape) for name in names]
         return np.stack(columns, axis=-1) if columns else np.empty((*shape, 0))
-    if inputs is None:
-        _check_names(names, {})
-        return np.empty((*shape, 0))
     values = np.asarray(inputs, dtype=np.float64)
     if values.shape != (*shape, len(names)):
         raise ValueError(

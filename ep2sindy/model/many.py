@@ -38,7 +38,7 @@ class WindowSteps:
         """
         places = first[:, None] + np.arange(n_samples - 1)
         h = np.repeat((t[places + 1] - t[places]) / n_substeps, n_substeps, axis=1)
-        if curve is None:
+        if curve is None or not curve.pieces.shape[2]:
             return WindowSteps(h, np.empty((*h.shape, 0, 3)), n_substeps)
         fractions = (np.arange(n_substeps)[:, None] + [0.0, 0.5, 1.0]) / n_substeps
         nodes = np.array(
@@ -64,31 +64,21 @@ def run_many(
     is farther than `reach` from the centre, and is NaN from there on.
     """
     starts = np.array(np.broadcast_to(starts, (len(field.coef), *starts.shape[-2:])), order="C")
-    route = _in_arrays if field.library.functions else _compiled
     if moves is None:
         moves = np.empty((*starts.shape[:2], 0, starts.shape[2]))
-    later = route(field, starts, steps, centre, reach, moves)
+    if field.library.functions:
+        later = _in_arrays(field, starts, steps, centre, reach, moves)
+    else:
+        from ep2sindy.model import kernels
+
+        table, product, target, weight = field.entries
+        by_model = np.count_nonzero(field.coef, axis=(1, 2))
+        later = kernels.run_many(
+            np.array(table), product, target, weight, np.append(0, by_model.cumsum()),
+            CLASSICAL.leads, CLASSICAL.weights, starts, np.array(steps.h, order="C"), steps.inputs,
+            moves, steps.n_substeps, np.array(centre), np.array(reach),
+        )  # fmt: skip
     return np.concatenate([starts[:, :, None], later], axis=2)
-
-
-def _compiled(
-    field: VectorField,
-    starts: np.ndarray,
-    steps: WindowSteps,
-    centre: np.ndarray,
-    reach: np.ndarray,
-    moves: np.ndarray,
-) -> np.ndarray:
-    from ep2sindy.model import kernels
-
-    table, product, target, weight = field.entries
-    by_model = np.count_nonzero(field.coef, axis=(1, 2))
-    paths: np.ndarray = kernels.run_many(
-        np.array(table), product, target, weight, np.append(0, by_model.cumsum()),
-        CLASSICAL.leads, CLASSICAL.weights, starts, np.array(steps.h, order="C"), steps.inputs,
-        moves, steps.n_substeps, np.array(centre), np.array(reach),
-    )  # fmt: skip
-    return paths
 
 
 def _in_arrays(
@@ -99,7 +89,7 @@ def _in_arrays(
     reach: np.ndarray,
     moves: np.ndarray,
 ) -> np.ndarray:
-    """`_compiled` for libraries with functions, which are evaluated for all runs at once."""
+    """Later states by a library with functions, which are evaluated for all runs at once."""
 
     def rates(x: np.ndarray, inputs: np.ndarray) -> np.ndarray:
         driven = np.broadcast_to(inputs, (*x.shape[:2], inputs.shape[1]))

@@ -21,9 +21,9 @@ from ep2sindy.library.library import Library
 from ep2sindy.library.units import SECONDS, Clock
 from ep2sindy.model.display import model_html, model_lines
 from ep2sindy.model.draws import draw_coef, draw_runs
-from ep2sindy.model.inputs import check_courses, curve_through, driven, inputs_at_samples
+from ep2sindy.model.inputs import check_courses, driven, inputs_at_samples
 from ep2sindy.model.restarts import one_step
-from ep2sindy.model.rollout import Rollout, check_start, integrate, simulate
+from ep2sindy.model.rollout import Rollout, check_start, simulate
 from ep2sindy.model.scores import r2
 from ep2sindy.model.storage import model_text, read_model, read_stored
 from ep2sindy.model.vector_field import VectorField
@@ -225,22 +225,22 @@ class SparseModel:
         Raises
         ------
         ValueError
-            If the window lies outside the trajectory, or a variable is missing.
+            If the window lies outside the trajectory, a variable is missing, or the initial state
+            does not hold a finite number for each state.
         """
         run = trajectory_of(trajectory)
         window = run.window(start, run.n_samples if n_samples is None else start + n_samples)
         data, samples = window.columns(self.states), window.columns(self.inputs)
-        found = integrate(
+        found = simulate(
             self,
             window.t,
-            data[0] if initial is None else initial,
-            drive=curve_through(window.t, samples, list(map(self.courses.get, self.inputs))),
-            samples=samples,
-            scale=np.abs(data).max(axis=0),
+            data[0] if initial is None else check_start(self.states, initial, name="initial"),
+            samples,
             blow_up=blow_up,
-            bound="the data's largest value",
             rtol=rtol,
             limit_s=limit_s,
+            reach=np.abs(data).max(axis=0),
+            bound="the data's largest value",
         )
         return replace(found, clock=run.clock)
 
@@ -409,8 +409,7 @@ class SparseModel:
 
     def latex(self, *, digits: int = 3) -> str:
         """LaTeX `aligned` block with one equation per line."""
-        terms = {state: self.terms(state) for state in self.states}
-        return equations_latex(terms, digits=digits)
+        return equations_latex({state: self.terms(state) for state in self.states}, digits=digits)
 
     def __str__(self) -> str:
         """Equations with units and, where a covariance is known, 95 % intervals."""
@@ -429,15 +428,7 @@ class SparseModel:
 
     def to_json(self) -> str:
         """JSON text of the whole model; floats in their shortest exact form."""
-        return model_text(
-            self.library,
-            {state: self.terms(state) for state in self.states},
-            units=self.units,
-            provenance=self.provenance,
-            covariance=self.covariance,
-            clock=self.clock,
-            courses=self.courses,
-        )
+        return model_text(self, self.provenance)
 
     @staticmethod
     def from_json(text: str) -> SparseModel:

@@ -12,9 +12,8 @@ from jaxtyping import Float, Int
 from ep2sindy.data.gaps import between_gaps
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.model.draws import BLOW_UP, MAX_SUBSTEPS, step_error
+from ep2sindy.model.draws import BLOW_UP, MAX_SUBSTEPS, runs_from, step_error
 from ep2sindy.model.inputs import Curve, driven
-from ep2sindy.model.many import WindowSteps, run_many
 from ep2sindy.model.vector_field import Equations, VectorField
 from ep2sindy.signals.attractor import noise_std
 
@@ -73,13 +72,9 @@ class Restarts:
         return VectorField.of(model.library, [*model.states, *model.inputs], model.coef[None])
 
     @cached_property
-    def _drive(self) -> Curve | None:
+    def _drive(self) -> Curve:
         model, run = self.model, self.record
-        return (
-            driven(model.inputs, run.columns(model.inputs), run.t, model.courses)[0]
-            if model.inputs
-            else None
-        )
+        return driven(model.inputs, run.columns(model.inputs), run.t, model.courses)[0]
 
     @cached_property
     def _bound(self) -> Float[np.ndarray, " n_states"]:
@@ -118,10 +113,8 @@ class Restarts:
         n_ahead: int,
     ) -> Float[np.ndarray, "runs samples n_states"]:
         """States of runs from the samples `first`, these included; NaN after one has diverged."""
-        run = self.record
-        steps = WindowSteps.along(run.t, self._drive, first, n_ahead + 1, self._n_substeps)
-        centre = np.zeros(len(self._bound))
-        return run_many(self._field, starts[None], steps, centre=centre, reach=self._bound)[0]
+        n, t = self._n_substeps, self.record.t
+        return runs_from(self._field, starts, t, self._drive, first, n_ahead + 1, n, self._bound)
 
     def off(
         self, paths: Float[np.ndarray, "runs samples n_states"], first: Int[np.ndarray, " runs"]

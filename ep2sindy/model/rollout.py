@@ -122,30 +122,50 @@ def simulate(
     rtol: float = 1e-8,
     limit_s: float = 300.0,
     reach: Float[np.ndarray, " n_states"] | None = None,
+    bound: str = "the largest expected",
 ) -> Rollout:
     """Integrate a model freely from one state; see `SparseModel.simulate`.
 
     reach: (n_states,), largest states expected, in SI, that scale the run in place of its start;
-    a start where a state passes through zero tells nothing of its size.
+    a start where a state passes through zero tells nothing of its size. bound: what they are, in
+    words.
     """
     times = np.asarray(t, dtype=np.float64)
     start = check_start(model.states, x0, hint="; the order is simulate(t, x0)")
     check_time(times)
     drive, samples = driven(model.inputs, inputs, times, model.courses)
-    # An input may begin at zero as well: its largest sample tells what it does to a state.
-    driving = np.take_along_axis(samples, np.abs(samples).argmax(axis=0, keepdims=True), axis=0)
-    sizes = start_scale(model, start, driving[0], float(times[-1] - times[0]))
-    return integrate(
-        model,
-        times,
-        start,
-        drive=drive,
-        samples=samples,
-        scale=sizes if reach is None else zero_to_one(reach),
-        blow_up=blow_up,
-        bound="its start" if reach is None else "the largest expected",
-        rtol=rtol,
-        limit_s=limit_s,
+    if reach is None:
+        # An input may begin at zero as well: its largest sample tells what it does to a state.
+        driving = np.take_along_axis(samples, np.abs(samples).argmax(axis=0, keepdims=True), axis=0)
+        reach = start_scale(model, start, driving[0], float(times[-1] - times[0]))
+        bound = "its start"
+    scale = zero_to_one(reach)
+    y, border = start / scale, _border(model.field, np.append(start, samples[0]), drive, scale)
+    if border and (edge := border(times[0], y)):
+        message = f"the start, at t = {times[0]:.6g} s, is outside {edge.text}"
+        found = Integration(times[:1], y[None], -1, message, edge)
+    else:
+        found = solve_stages(
+            Driven(model.field.scaled(scale), drive),
+            times,
+            y,
+            border=border,
+            stops=drive.stops,
+            blow_up=blow_up,
+            bound=bound,
+            rtol=rtol,
+            limit_s=limit_s,
+        )
+    return Rollout(
+        t=found.t,
+        states=found.y * scale,
+        diverged=found.ended_early,
+        message=found.message,
+        state_names=tuple(model.states),
+        inputs=samples[: len(found.t)],
+        input_names=tuple(model.inputs),
+        units=model.units,
+        outside=found.edge.function.name if found.edge else "",
     )
 
 
@@ -194,49 +214,6 @@ def check_start(
             f"{name} must give a finite number for each of {list(states)}, got {got}{hint}"
         )
     return start
-
-
-def integrate(
-    model: Equations,
-    t: np.ndarray,
-    x0: np.ndarray,
-    *,
-    drive: Curve,
-    samples: np.ndarray,
-    scale: np.ndarray,
-    blow_up: float,
-    bound: str,
-    rtol: float,
-    limit_s: float,
-) -> Rollout:
-    """Integrate from x0 over t in units of `scale`, until a scaled state exceeds `blow_up`."""
-    y, border = x0 / scale, _border(model.field, np.append(x0, samples[0]), drive, scale)
-    if border and (edge := border(t[0], y)):
-        message = f"the start, at t = {t[0]:.6g} s, is outside {edge.text}"
-        found = Integration(t[:1], y[None], -1, message, edge)
-    else:
-        found = solve_stages(
-            Driven(model.field.scaled(scale), drive),
-            t,
-            y,
-            border=border,
-            stops=drive.stops,
-            blow_up=blow_up,
-            bound=bound,
-            rtol=rtol,
-            limit_s=limit_s,
-        )
-    return Rollout(
-        t=found.t,
-        states=found.y * scale,
-        diverged=found.ended_early,
-        message=found.message,
-        state_names=tuple(model.states),
-        inputs=samples[: len(found.t)],
-        input_names=tuple(model.inputs),
-        units=model.units,
-        outside=found.edge.function.name if found.edge else "",
-    )
 
 
 def _border(

@@ -247,13 +247,9 @@ def _smooth_stage(rhs: Counted, method: str, t: np.ndarray, y: np.ndarray) -> In
     )
     # A solver that failed in its first step gives an empty list.
     states = np.asarray(found.y, dtype=np.float64).reshape(len(y), -1).T
-    solution = Integration(
-        np.asarray(found.t, dtype=np.float64), states, found.status, found.message
-    )
-    if found.status == 1:
-        last_s, last = float(found.t_events[0][0]), found.y_events[0][0]
-        return replace(solution, last_s=last_s, last=last)
-    return solution
+    times = np.asarray(found.t, dtype=np.float64)
+    event = (float(found.t_events[0][0]), found.y_events[0][0]) if found.status == 1 else ()
+    return Integration(times, states, found.status, found.message, None, *event)
 
 
 def _compiled_stage(rhs: Counted, t: np.ndarray, y: np.ndarray) -> Integration:

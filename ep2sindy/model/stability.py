@@ -8,6 +8,7 @@ from functools import partial
 import numpy as np
 from jaxtyping import Complex, Float
 
+from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.model.draws import starts_around
 from ep2sindy.model.kernels import approach
 from ep2sindy.model.model import SparseModel
@@ -226,7 +227,19 @@ def basin_stability(
     Source: Menck, Heitzig, Marwan & Kurths 2013, doi:10.1038/nphys2516, for the measure.
     """
     n_periods = periods_to_reach(cycle) if n_periods is None else n_periods
-    _check_reach(model, cycle, n_starts=n_starts, n_periods=n_periods, spread=spread)
+    _check_free(model)
+    if cycle.states.shape[1] != len(model.states):
+        raise ValueError(
+            f"the cycle must be one of this model: it has {cycle.states.shape[1]} states, the "
+            f"model {list(model.states)}; take it from limit_cycle(model, ...)"
+        )
+    if n_starts < 1 or not (np.isfinite(n_periods) and n_periods > N_LATE):
+        raise ValueError(
+            f"one start or more and over {N_LATE:g} periods are needed, of which the last "
+            f"{N_LATE:g} are assessed, got n_starts={n_starts}, n_periods={n_periods}"
+        )
+    if not 0.0 < spread[0] < spread[1] < np.inf:
+        raise ValueError(f"spread must be two positive factors, the lower first, got {spread}")
     scale = deviations(cycle.states)
     field = model.field.scaled(scale, cycle.period_s)
     curve = cycle.states / scale
@@ -259,8 +272,7 @@ def multiplier_error(cycle: LimitCycle) -> float:
     if model.covariance is None:
         return EXACT
     used = model.coef.T != 0.0
-    size = np.sqrt(np.maximum(np.diag(model.covariance), 0.0))
-    scale = np.where(size > 0.0, size, 1.0)
+    scale = np.sqrt(zero_to_one(np.maximum(np.diag(model.covariance), 0.0)))
     values, vectors = np.linalg.eigh(model.covariance / np.outer(scale, scale))
     squares = EXACT**2
     for value, vector in zip(values, vectors.T, strict=True):
@@ -290,7 +302,7 @@ def end_of_long_run(
 
     n = N_END * N_SAMPLES_AT_END
     t = duration_s + period_s * np.arange(n) / N_SAMPLES_AT_END
-    scale = np.where(start == 0.0, 1.0, np.abs(start))
+    scale = zero_to_one(np.abs(start))
     scaled = Driven(model.field.scaled(scale))
     bound = BLOW_UP * np.sqrt(len(start))
 
@@ -376,29 +388,6 @@ def _check_free(model: SparseModel) -> None:
         )
 
 
-def _check_reach(
-    model: SparseModel,
-    cycle: LimitCycle,
-    *,
-    n_starts: int,
-    n_periods: float,
-    spread: tuple[float, float],
-) -> None:
-    _check_free(model)
-    if cycle.states.shape[1] != len(model.states):
-        raise ValueError(
-            f"the cycle must be one of this model: it has {cycle.states.shape[1]} states, the "
-            f"model {list(model.states)}; take it from limit_cycle(model, ...)"
-        )
-    if n_starts < 1 or not (np.isfinite(n_periods) and n_periods > N_LATE):
-        raise ValueError(
-            f"one start or more and over {N_LATE:g} periods are needed, of which the last "
-            f"{N_LATE:g} are assessed, got n_starts={n_starts}, n_periods={n_periods}"
-        )
-    if not 0.0 < spread[0] < spread[1] < np.inf:
-        raise ValueError(f"spread must be two positive factors, the lower first, got {spread}")
-
-
 # Closed orbits of a model without inputs, by Newton's method on the return after one period.
 
 
@@ -436,18 +425,6 @@ STILL = 1e-3
 N_SAMPLES = 200
 
 
-def _run(
-    model: SparseModel, start: Float[np.ndarray, " n_states"], *, period_s: float, n_periods: float
-) -> Float[np.ndarray, "samples n_states"] | None:
-    """States of a free run from a start, N_SAMPLES per period; None if they diverge."""
-    # A state that starts near zero has at least the size that its rate gives it in a period.
-    moved = np.abs(model.derivative(start, np.empty(0))) * period_s
-    size = np.maximum(start_scale(model, start, np.empty(0), period_s), moved)
-    t = period_s * np.linspace(0.0, n_periods, round(N_SAMPLES * n_periods) + 1)
-    run = simulate(model, t, start, None, blow_up=START_BLOW_UP, rtol=START_RTOL, reach=size)
-    return None if run.diverged else run.states
-
-
 def _find_orbit(
     model: SparseModel,
     start: Float[np.ndarray, " n_states"],
@@ -461,10 +438,15 @@ def _find_orbit(
     The closest return of the run starts Newton's method. None if the run diverges, or if Newton's
     method does not close the orbit, or ends on a fixed point.
     """
-    run = _run(model, start, period_s=period_s, n_periods=n_settling + RETURNS[1])
-    if run is None:
+    # A state that starts near zero has at least the size that its rate gives it in a period.
+    moved = np.abs(model.derivative(start, np.empty(0))) * period_s
+    size = np.maximum(start_scale(model, start, np.empty(0), period_s), moved)
+    n_periods = n_settling + RETURNS[1]
+    t = period_s * np.linspace(0.0, n_periods, round(N_SAMPLES * n_periods) + 1)
+    free = simulate(model, t, start, None, blow_up=START_BLOW_UP, rtol=START_RTOL, reach=size)
+    if free.diverged:
         return None
-    run = run[n_settling * N_SAMPLES :]
+    run = free.states[n_settling * N_SAMPLES :]
     scale = deviations(run)
     field = model.field.scaled(scale, period_s)
     departing = Driven(field.with_perturbations())
@@ -509,7 +491,7 @@ def deviations(states: Float[np.ndarray, "samples n_states"]) -> Float[np.ndarra
     """Standard deviations of the states; the size of a constant state, or one if it is zero."""
     # Less than the first run resolves is rounding: by it, a point of rest would look like a cycle.
     std, size = states.std(axis=0), np.abs(states).max(axis=0)
-    return np.where(std > START_RTOL * size, std, np.where(size > 0.0, size, 1.0))
+    return np.where(std > START_RTOL * size, std, zero_to_one(size))
 
 
 def _close_orbit(

@@ -13,8 +13,9 @@ from jaxtyping import Float
 
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.library.functions import UnknownFunctionError
-from ep2sindy.library.library import Library, named_terms
+from ep2sindy.library.library import named_terms
 from ep2sindy.library.units import SECONDS, Clock
+from ep2sindy.model.vector_field import Equations
 from ep2sindy.runtime.files import read_bytes, read_json
 from ep2sindy.runtime.screen import words_of
 
@@ -25,31 +26,22 @@ Model = TypeVar("Model")
 ROUNDING = 1e-6  # tolerance for rounding errors in a correlation
 
 
-def model_text(
-    library: Library,
-    equations: Mapping[str, Mapping[str, float]],
-    *,
-    units: Mapping[str, str],
-    provenance: Mapping[str, str],
-    covariance: Float[np.ndarray, "_ _"] | None,
-    clock: Clock,
-    courses: Mapping[str, str],
-) -> str:
+def model_text(model: Equations, provenance: Mapping[str, str]) -> str:
     """JSON text of the whole model; floats in their shortest exact form."""
     content = {
         "format": FORMAT,
-        "states": list(equations),
-        "variables": list(library.variables),
-        "library": list(library.names),
-        "equations": equations,
-        "units": dict(units),
+        "states": list(model.states),
+        "variables": list(model.library.variables),
+        "library": list(model.library.names),
+        "equations": {state: model.terms(state) for state in model.states},
+        "units": dict(model.units),
         "provenance": dict(provenance),
-        "covariance": None if covariance is None else covariance.tolist(),
+        "covariance": None if model.covariance is None else model.covariance.tolist(),
     }
-    if clock != SECONDS:
-        content["clock"] = {"unit": clock.unit, "seconds": clock.seconds}
-    if courses:
-        content["courses"] = dict(courses)
+    if model.clock != SECONDS:
+        content["clock"] = {"unit": model.clock.unit, "seconds": model.clock.seconds}
+    if model.courses:
+        content["courses"] = dict(model.courses)
     return json.dumps(content, indent=2, allow_nan=False) + "\n"
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -53,32 +54,22 @@ def ionization_rate(
         )
     T_e_eV = field["T_e_eV"].astype(np.float64)
     rate: Callable = propellants.ionization_rate
-    if table is not None:
-        rate = _interpolate_table(*read_rate_table(Path(table)), T_e_eV, f"extend {table}")
-    elif gas != "xenon":
-        known = propellant(gas)
-        rows = np.array(known.T_e_eV), np.array(known.ionization_rate)
-        rate = _interpolate_table(
-            *rows, T_e_eV, "keep_where leaves cells out, or give a table of your own"
-        )
+    if table is not None or gas != "xenon":
+        if table is not None:
+            (T_eV, rates), hint = read_rate_table(Path(table)), f"extend {table}"
+        else:
+            known = propellant(gas)
+            hint = "keep_where leaves cells out, or give a table of your own"
+            T_eV, rates = np.array(known.T_e_eV), np.array(known.ionization_rate)
+        low, high = float(T_e_eV.min()), float(T_e_eV.max())
+        if low < T_eV[0] or high > T_eV[-1]:
+            raise ValueError(
+                f"T_e_eV must stay in the rate table, {T_eV[0]:g} to {T_eV[-1]:g} eV: it runs "
+                f"from {low:g} to {high:g} eV; {hint}"
+            )
+        rate = partial(np.interp, xp=T_eV, fp=rates)
     R_ion = xr.apply_ufunc(rate, T_e_eV, dask="parallelized", output_dtypes=[np.float64])
     return field.assign(R_ion=R_ion.drop_attrs(deep=False).assign_attrs(units="m^3/s"))
-
-
-def _interpolate_table(
-    T_eV: Float[np.ndarray, " rows"],
-    rates: Float[np.ndarray, " rows"],
-    T_e_eV: xr.DataArray,
-    hint: str,
-) -> Callable:
-    """Interpolate linearly in a table, which must cover all temperatures."""
-    low, high = float(T_e_eV.min()), float(T_e_eV.max())
-    if low < T_eV[0] or high > T_eV[-1]:
-        raise ValueError(
-            f"T_e_eV must stay in the rate table, {T_eV[0]:g} to {T_eV[-1]:g} eV: it runs "
-            f"from {low:g} to {high:g} eV; {hint}"
-        )
-    return lambda T: np.interp(T, T_eV, rates)
 
 
 def read_rate_table(path: Path) -> tuple[Float[np.ndarray, " rows"], Float[np.ndarray, " rows"]]:

@@ -175,11 +175,7 @@ class PressureShift:
     def __post_init__(self) -> None:
         check_positive(self, "pressure_Pa")
         check_range(self, "above 1", lambda value: value > 1.0, "alpha")
-        if not np.isfinite([self.z0, self.dz]).all():
-            raise ValueError(
-                f"PressureShift.z0 and dz must be finite, in channel lengths, got {self.z0!r} and "
-                f"{self.dz!r}"
-            )
+        check_range(self, "finite, in channel lengths", lambda _: True, "z0", "dz")
 
     def shift(self, pressure_Pa: float) -> float:
         """Where the transport stands at a pressure, in channel lengths from its own place."""

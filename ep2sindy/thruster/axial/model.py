@@ -186,31 +186,22 @@ def followers_of(
         else:
             state.tangent[:] = spreading.target()
         spreading.set_areas()
-    if isinstance(thruster.transport, FunctionTransport):
-        followers.append(_transport(thruster.transport, thruster, model, state, faces))
+    transport = thruster.transport
+    if isinstance(transport, FunctionTransport):
+        distance = lengths_and_centres(faces)[1][1:-1] - thruster.channel_length
+        B = thruster.magnetic_field.at(distance)
+
+        def set_collisions(sample_s: float) -> None:
+            """Anomalous collisions by a user's function of the plasma, which gets copies."""
+            cells = (state.n_e, state.T_e_eV, state.E, state.n_n)
+            n_e, T_e_eV, E, n_n = (values[1:-1].copy() for values in cells)
+            u_i = (state.flux_i.sum(axis=0) / state.n_i.sum(axis=0))[1:-1]
+            plasma = Plasma(n_e=n_e, T_e_eV=T_e_eV, E=E, n_n=n_n, u_i=u_i, B=B.copy())
+            c = transport.at(distance.copy(), float(state.clock[0]), plasma)
+            model.anomalous[:] = np.pad(c, 1, mode="edge") * model.omega_ce
+
+        followers.append(set_collisions)
     return followers
-
-
-def _transport(
-    transport: FunctionTransport,
-    thruster: Thruster,
-    model: AxialModel,
-    state: AxialState,
-    faces: Float[np.ndarray, " faces"],
-) -> Follower:
-    """Anomalous collisions by a user's function of the plasma, which gets copies."""
-    distance = lengths_and_centres(faces)[1][1:-1] - thruster.channel_length
-    B = thruster.magnetic_field.at(distance)
-
-    def follow(sample_s: float) -> None:
-        cells = (state.n_e, state.T_e_eV, state.E, state.n_n)
-        n_e, T_e_eV, E, n_n = (values[1:-1].copy() for values in cells)
-        u_i = (state.flux_i.sum(axis=0) / state.n_i.sum(axis=0))[1:-1]
-        plasma = Plasma(n_e=n_e, T_e_eV=T_e_eV, E=E, n_n=n_n, u_i=u_i, B=B.copy())
-        c = transport.at(distance.copy(), float(state.clock[0]), plasma)
-        model.anomalous[:] = np.pad(c, 1, mode="edge") * model.omega_ce
-
-    return follow
 
 
 @dataclass(frozen=True, eq=False)

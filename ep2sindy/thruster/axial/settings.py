@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ep2sindy.thruster.axial.model import CFL
-from ep2sindy.thruster.checks import check_not_negative, check_positive
+from ep2sindy.thruster.checks import check_not_negative, check_positive, check_range
 from ep2sindy.trust.memory import check_memory
 
 MIN_STEPS = 16  # fewer samples cannot show an oscillation
@@ -44,8 +44,7 @@ class Settings:
             f"duration_s / sample_s = {n_samples:.3g} samples of n_cells = {self.n_cells}",
             hint="simulate less of each",
         )
-        if not 0.0 < self.cfl <= 1.0:
-            raise ValueError(f"cfl must be above 0 and at most 1, got {self.cfl!r}")
+        check_range(self, "above 0 and at most 1", lambda value: 0.0 < value <= 1.0, "cfl")
 
 
 def to_json(parameters: dict[str, Any]) -> str:

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -130,12 +129,9 @@ def simulate(
     settings = Settings(*run, n_cells, stretch, reconstruct, cfl, coldest_T_e_eV)
     start = as_start(initial)
     compute = partial(simulate_as, settings, thruster, operating_point, start, progress=progress)
-    parameters = _parameters(settings, thruster, operating_point) | {"initial": start.label}
+    parameters = {"thruster": thruster, "operating_point": operating_point, "settings": settings}
+    parameters["initial"] = start.label
     return read_or_run(cache, f"thruster_{operating_point.label}", parameters, compute, progress)
-
-
-def _parameters(settings: Settings, thruster: Thruster, point: OperatingPoint) -> dict[str, Any]:
-    return {"thruster": thruster, "operating_point": point, "settings": settings}
 
 
 def simulate_as(
@@ -147,7 +143,7 @@ def simulate_as(
     progress: Progress | bool,
 ) -> xr.Dataset:
     """Run `simulate` with its settings as one value."""
-    parameters = to_json(_parameters(settings, thruster, point))
+    parameters = to_json({"thruster": thruster, "operating_point": point, "settings": settings})
     faces = cell_faces(thruster, settings.n_cells, settings.stretch)
     model = build_model(
         thruster, point, faces, end_s=settings.duration_s + settings.sample_s, cfl=settings.cfl,
@@ -164,15 +160,26 @@ def simulate_as(
     )
     cathode_V = point.voltage - float(model.supply[0])
     series = series_of(record.series, model, cathode_V=cathode_V, sample_s=sample_s, plume=plume)
-    end = end_of(record.state)
-    field = labelled(columns, record.fields, series, end, sample_s=sample_s, faces=faces)
+    profiles = end_of(record.state)
+    field = labelled(columns, record.fields, series, profiles, sample_s=sample_s, faces=faces)
     field.attrs = {
         "title": "1-D axial Hall-thruster fluid model",
         "parameters": parameters,
         INFLOW: model.neutral_inflow,
         "initial": f"{start.label}, {beginning.note}" if beginning.note else start.label,
-        **_attributes(field, record, model, point, thruster, sample_s),
+        **outcome(field, point, ion_mass=model.ion_mass, diverged=record.diverged),
     }
+    if field.sizes["time"]:
+        field.attrs["I_wall_mean"] = float(field["I_wall"].mean())
+        seconds = sample_s * field.sizes["time"]
+        field.attrs["energy_balance"] = energy_balance(field, record, seconds)
+        if "dn_n_dt" in field:
+            field.attrs["mass_balance"] = mass_balance(field, model, seconds)
+    hottest, end = float(record.state.hottest_eV[0]), record.state.instant
+    field.attrs["rates"] = describe_uncovered(thruster.propellant, hottest) or "covered"
+    # Data that a restart needs besides the profiles.
+    needed = {"I_d": recorded.CURRENT, "V": recorded.VOLTAGE, "I_supply": recorded.SUPPLY_CURRENT}
+    field.attrs |= {f"end_{name}": float(end[place]) for name, place in needed.items()}
     return field
 
 
@@ -272,29 +279,6 @@ def _march(
         return rows.stop - rows.start
 
     return (march_by_samples if followers else march), fields, series
-
-
-def _attributes(
-    field: xr.Dataset,
-    record: Record,
-    model: AxialModel,
-    point: OperatingPoint,
-    thruster: Thruster,
-    sample_s: float,
-) -> dict[str, Any]:
-    """Verdict, performance, balances, and data that a restart needs besides the profiles."""
-    attributes = outcome(field, point, ion_mass=model.ion_mass, diverged=record.diverged)
-    if field.sizes["time"]:
-        attributes["I_wall_mean"] = float(field["I_wall"].mean())
-        seconds = sample_s * field.sizes["time"]
-        attributes["energy_balance"] = energy_balance(field, record, seconds)
-        if "dn_n_dt" in field:
-            attributes["mass_balance"] = mass_balance(field, model, seconds)
-    hottest = float(record.state.hottest_eV[0])
-    attributes["rates"] = describe_uncovered(thruster.propellant, hottest) or "covered"
-    end = record.state.instant
-    attributes["end_I_d"], attributes["end_V"] = end[[recorded.CURRENT, recorded.VOLTAGE]].tolist()
-    return attributes | {"end_I_supply": float(end[recorded.SUPPLY_CURRENT])}
 
 
 def mass_balance(field: xr.Dataset, model: AxialModel, seconds: float) -> float:

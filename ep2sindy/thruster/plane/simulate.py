@@ -39,7 +39,7 @@ from ep2sindy.thruster.recording import (
 )
 from ep2sindy.thruster.transport import AnomalousTransport, FunctionTransport
 from ep2sindy.thruster.verdict import outcome
-from ep2sindy.thruster.walls import SHEATH_DENSITY_RATIO, FixedAnode, SheathWall
+from ep2sindy.thruster.walls import FixedAnode, SheathWall
 
 PLANES = {  # variable -> unit, long name; in the order of the compiled loop
     "n_i": ("m^-3", "ion density"),
@@ -280,9 +280,9 @@ def plane_table(thruster: Thruster) -> Float[np.ndarray, "temperatures columns"]
     ratio * sqrt(e T_e/m) n / gap.
     """
     table = closure_table(thruster)
-    bohm = np.sqrt(E_CHARGE * table_temperatures() / thruster.propellant.mass)
-    ions = SHEATH_DENSITY_RATIO * bohm / thruster.gap  # 1/s
-    table[:, [WALL_COLLISION, WALL_POWER]] /= ions[:, None]
+    wall = SheathWall(ion_scale=1.0)  # that ions reach with ratio * sqrt(e T_e/m) / gap
+    ions = wall.ion_loss(table_temperatures(), thruster.gap, thruster.propellant.mass)
+    table[:, [WALL_COLLISION, WALL_POWER]] /= np.asarray(ions)[:, None]
     return table
 
 
@@ -347,6 +347,7 @@ def state_of(
     def empty() -> kernels.Gas:
         return kernels.Gas(*(np.zeros(shape) for _ in kernels.Gas._fields))
 
+    along_z = ("drift_eV", "ionization", "reference_field", "wall", "side")
     gas = empty()
     gas.n[:], gas.flux_z[:], gas.neutrals[:] = n_i, flux_z, n_n
     return kernels.PlaneState(
@@ -356,11 +357,7 @@ def state_of(
         log_n=np.zeros(shape),
         T_e_eV=T_e_eV.copy(),
         energy=1.5 * inside * T_e_eV,
-        drift_eV=np.zeros(grid.n_z),
-        ionization=np.zeros(grid.n_z),
-        reference_field=np.zeros(grid.n_z),
-        wall=np.zeros(grid.n_z),
-        side=np.zeros(grid.n_z),
+        **{name: np.zeros(grid.n_z) for name in along_z},
         current=np.zeros(1),
         left=np.zeros(1),
     )
