@@ -50,7 +50,7 @@ def main() -> None:
             found = [ep.evaluate(each, run) for each in laws(system.model, run, seed)]
             follows.append([each.status is ep.model.Status.FOLLOWS for each in found])
             distances.append(max(found[0].distance.values()))
-            vetoed.append(bool(found[0].one_step.rival))
+            vetoed.append(bool(found[0].one_step and found[0].one_step.rival))
         low, middle, high = np.quantile(distances, [0.1, 0.5, 0.9])
         counts = "  ".join(f"{n:5d}" for n in np.sum(follows, axis=0))
         print(

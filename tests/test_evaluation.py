@@ -175,6 +175,7 @@ def test_of_several_records_the_worst_run_counts() -> None:
     assert found.status is Status.WRONG_CYCLE
     np.testing.assert_array_equal(found.record.states, apart.states)
     assert worst_run(found.each) is found.each[1]
+    assert found.one_step is not None
     assert found.one_step.n_ahead == 1
     assert len(found.one_step.error) == 3 * 200  # starts
 
@@ -269,6 +270,7 @@ def test_an_exact_law_under_inputs_follows_the_samples_to_within_their_noise() -
     for each in found.each:
         assert max(each.distance.values()) == pytest.approx(1.0, abs=0.15)
     assert found.heading.startswith("follows the samples for 39.")
+    assert found.one_step is not None
     limit = float(found.one_step.limit.mean())
     assert found.one_step.score == pytest.approx(limit, abs=0.005)
     assert f"; the noise allows {limit:.3f}" in found.one_step.text

@@ -6,7 +6,6 @@ import pytest
 from ep2sindy.forecasting.baselines import standard_error
 from ep2sindy.forecasting.forecast import Forecast
 from ep2sindy.forecasting.skill import EXCEEDS, SURE, ForecastSkill
-from ep2sindy.library.units import SECONDS
 
 N_HORIZONS = 40
 AHEAD = Forecast(
@@ -18,9 +17,7 @@ AHEAD = Forecast(
 def skill(apart_s: float = 1.0, **squared: np.ndarray) -> ForecastSkill:
     """Of errors (starts, horizons) up to two periods of a second."""
     horizons_s = np.linspace(0.05, 2.0, N_HORIZONS)
-    return ForecastSkill(
-        horizons_s, 1.0, 0.05, apart_s, squared, 0.9, example=AHEAD, order=3, clock=SECONDS
-    )
+    return ForecastSkill(horizons_s, 1.0, 0.05, apart_s, squared, 0.9, example=AHEAD, order=3)
 
 
 def errors(size: float | np.ndarray, *, seed: int = 0, n: int = 40) -> np.ndarray:

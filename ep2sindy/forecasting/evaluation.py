@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from html import escape
@@ -205,9 +206,14 @@ class Evaluation:
         return MappingProxyType(dict(zip(self.model.states, values, strict=True)))
 
     @cached_property
-    def one_step(self) -> OneStep:
-        """Forecasts over one step, from samples alone; of several records, over all of them."""
-        return one_step(self.model, [run.record for run in self.each or [self]])
+    def one_step(self) -> OneStep | None:
+        """Forecasts over one step, from samples alone; of several records, over all of them.
+
+        None for records too short for one.
+        """
+        with suppress(ValueError):
+            return one_step(self.model, [run.record for run in self.each or [self]])
+        return None
 
     @property
     def rival(self) -> str:
@@ -218,7 +224,9 @@ class Evaluation:
         """
         if self.status is Status.FOLLOWS:
             return ""
-        return self.one_step.rival if self.forecast is None else self.forecast.veto
+        if self.forecast is not None:
+            return self.forecast.veto
+        return self.one_step.rival if self.one_step else ""
 
     @property
     def text(self) -> str:
@@ -406,6 +414,15 @@ class Evaluation:
         return [f"rests at {each.text(self.model, self.rollout.clock)}" for each in known]
 
     @property
+    def frequency_text(self) -> str:
+        """`20 kHz (+1.2 %)`, the first state's frequency and its error; a dash if it has none."""
+        frequency_Hz = self.frequency_Hz[self.model.states[0]]
+        if not np.isfinite(frequency_Hz):
+            return "-"
+        error = f" ({error_text(self.f_error)})" if np.isfinite(self.f_error) else ""
+        return f"{self.rollout.clock.frequency_text(frequency_Hz)}{error}"
+
+    @property
     def distance_text(self) -> str:
         """`x 1.02, y 0.98 times the noise`; empty for a run that no start keeps finite."""
         known = {state: f"{d:.3g}" for state, d in self.distance.items() if d <= LEFT}
@@ -415,17 +432,10 @@ class Evaluation:
     def table(self) -> list[tuple[str, str, str]]:
         """Quantity, data and model, as text: of the cycle, or else the distance in noises."""
         clock, states = self.rollout.clock, self.model.states
-        data, own = self.compared.cycle, self.frequency_Hz[states[0]]
-        rows = []
+        data, rows = self.compared.cycle, []
         if data is not None and np.isfinite(self.f_error) and not self.is_driven:
-            error = f" ({error_text(self.f_error)})"
-            rows.append(
-                (
-                    "frequency",
-                    clock.frequency_text(data.frequency_Hz),
-                    f"{clock.frequency_text(own)}{error}" if np.isfinite(own) else "-",
-                )
-            )
+            theirs = clock.frequency_text(data.frequency_Hz)
+            rows.append(("frequency", theirs, self.frequency_text))
         sizes = self.compared.std, self.compared.std * self.comparison.by_state["amplitude_ratio"]
         if self.is_driven:
             sizes = self.compared.states.std(axis=0), self.rollout.states.std(axis=0)
@@ -462,20 +472,12 @@ class Evaluation:
             ("distance", self.distance_text),
             *([] if self.is_driven else compared),
             *(("rests", text.removeprefix("rests ")) for text in self.rest_texts),
-            ("score", self._score_text),
+            ("score", self.one_step.text if self.one_step else ""),
             ("forecasts", "" if self.forecast is None else self.forecast.text),
             ("missing", self.missing),
             ("lack of fit", self.lack_of_fit),
         ]
         return [(name, value) for name, value in found if value]
-
-    @property
-    def _score_text(self) -> str:
-        """Of forecasts over one step; empty for a record too short for one."""
-        try:
-            return self.one_step.text
-        except ValueError:
-            return ""
 
     def __repr__(self) -> str:
         rows = [

@@ -39,7 +39,6 @@ from ep2sindy.forecasting.forecast import (
     calibrate,
 )
 from ep2sindy.forecasting.state_estimation import StateEstimator, tune_estimator
-from ep2sindy.library.units import Clock
 from ep2sindy.model.model import SparseModel
 from ep2sindy.runtime.progress import Progress, as_progress
 from ep2sindy.runtime.threads import one_thread
@@ -97,7 +96,6 @@ class ForecastSkill:
     coverage_90: float
     example: Forecast = field(repr=False)
     order: int
-    clock: Clock = field(repr=False)
     resampled: bool = False
     seen: bool = False
 
@@ -351,7 +349,6 @@ def forecast_skill(
         coverage_90=rolling.coverage(ahead, LEVEL),
         example=ahead[0],
         order=0 if linear is None else linear.order,
-        clock=record.clock,
         resampled=not is_uniform(record.t),
     )
 

@@ -13,7 +13,7 @@ import pandas as pd
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.figures import series
 from ep2sindy.forecasting.baselines import AUTOREGRESSION
-from ep2sindy.forecasting.evaluation import Evaluation, error_text, size_text
+from ep2sindy.forecasting.evaluation import Evaluation, size_text
 from ep2sindy.forecasting.skill import ForecastSkill
 from ep2sindy.library.relations import Constraint
 from ep2sindy.report.document import Block, Result, Table, Text
@@ -170,15 +170,6 @@ def errors_table(skill: ForecastSkill) -> Table:
     return Table(rows, title=title, note=skill.nearest_text)
 
 
-def frequency_words(run: Evaluation) -> str:
-    """`20 kHz (+1.2 %)`: the first state's frequency and its error; a dash if it has none."""
-    frequency_Hz = run.frequency_Hz[run.model.states[0]]
-    if not np.isfinite(frequency_Hz):
-        return "-"
-    error = f" ({error_text(run.f_error)})" if np.isfinite(run.f_error) else ""
-    return f"{run.rollout.clock.frequency_text(frequency_Hz)}{error}"
-
-
 def _size(ratio: float) -> str:
     """A ratio of sizes in a table; a dash if it is not known."""
     return size_text(ratio, ".3f") if ratio == ratio else "-"
@@ -190,7 +181,7 @@ EVALUATION: Metrics[Evaluation] = [
     Metric("from_s", lambda run: float(run.record.t[0])),
     Metric("to_s", lambda run: float(run.record.t[-1])),
     Metric("record_frequency_Hz", lambda run: _record_frequency_Hz(run)),
-    Metric("frequency", frequency_words, View.SCREEN),
+    Metric("frequency", lambda run: run.frequency_text, View.SCREEN),
     Metric("frequency_Hz", lambda run: run.frequency_Hz),
     Metric("f_kHz", lambda run: 1e-3 * run.frequency_Hz[run.model.states[0]], View.HEADLINE),
     Metric("f_error", lambda run: run.f_error, COMPARED),
