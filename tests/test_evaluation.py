@@ -13,7 +13,6 @@ from ep2sindy.library.library import polynomial
 from ep2sindy.model.comparison import FreeRunBounds, Status
 from ep2sindy.model.model import SparseModel, coef_matrix
 from ep2sindy.model.stability import basin_stability, multiplier_error
-from ep2sindy.studies.views import worst_run
 from ep2sindy.systems.systems import lorenz, lotka_volterra
 from tests.models import model_of
 
@@ -174,7 +173,6 @@ def test_of_several_records_the_worst_run_counts() -> None:
     ]  # fmt: skip
     assert found.status is Status.WRONG_CYCLE
     np.testing.assert_array_equal(found.record.states, apart.states)
-    assert worst_run(found.each) is found.each[1]
     assert found.one_step is not None
     assert found.one_step.n_ahead == 1
     assert len(found.one_step.error) == 3 * 200  # starts

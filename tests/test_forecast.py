@@ -125,7 +125,7 @@ def driven_spring(n: int = 1200) -> Trajectory:
 def test_inputs_are_known_ahead_to_model_and_autoregression() -> None:
     run = driven_spring()
     skill = ep.model.forecast_skill(DRIVEN, run, n_fitted=900, starts=20)
-    assert skill.is_better
+    assert skill.better is not None
     assert skill.nrmse["model"].max() < 0.15
     assert skill.nrmse["autoregression"][-1] < 0.5 * skill.nrmse["neighbours"][-1]
     assert 0.8 <= skill.coverage_90 <= 0.97

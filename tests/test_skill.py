@@ -61,8 +61,8 @@ def test_errors_above_the_mean_s_are_no_forecast() -> None:
 
 
 def test_one_start_or_equal_errors_tell_nothing() -> None:
-    assert not skill(model=errors(0.1, n=1), autoregression=errors(0.3, n=1)).is_better
-    assert not skill(model=errors(0.1), autoregression=errors(0.1)).is_better
+    assert skill(model=errors(0.1, n=1), autoregression=errors(0.3, n=1)).better is None
+    assert skill(model=errors(0.1), autoregression=errors(0.1)).better is None
 
 
 @pytest.mark.parametrize("overlap", [1, 5, 10])

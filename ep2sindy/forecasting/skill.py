@@ -157,11 +157,6 @@ class ForecastSkill:
         return bool(gain.mean() > bound)
 
     @property
-    def is_better(self) -> bool:
-        """Whether the model forecasts better than the rival at some horizons."""
-        return self.better is not None
-
-    @property
     def better_periods(self) -> tuple[float, float] | None:
         """From where to where it does, in periods, or in samples without an oscillation."""
         return self._in_units(self.better)
@@ -241,7 +236,7 @@ class ForecastSkill:
         places = sorted({round(k / 16 * last) for k in (0, 1, 2, 4, 8, 12, 16)})
         return {
             "text": self.text,
-            "is_better": self.is_better,
+            "is_better": self.better is not None,
             "horizons_periods": [h / self.unit_s for h in self.horizons_s[places].tolist()],
             "nrmse": {name: values[places].tolist() for name, values in self.nrmse.items()},
             "better_periods": self.better_periods,

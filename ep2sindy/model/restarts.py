@@ -168,14 +168,13 @@ class Restarts:
 class OneStep:
     """Forecasts over one step from samples all over some records, from these samples alone.
 
-    n_ahead: samples in the step. span_s: its mean duration. r2: (n_states,), of the change that is
-    foreseen over the step: 1 is exact, 0 as good as that nothing changes. limit: (n_states,), what
-    the noise of the samples leaves an exact law. error, rest, mean: (starts,), mean squares over
-    states, in variances, of the model's error, of that of the last sample, and of that of the mean.
+    n_ahead: samples in the step. r2: (n_states,), of the change that is foreseen over the step: 1
+    is exact, 0 as good as that nothing changes. limit: (n_states,), what the noise of the samples
+    leaves an exact law. error, rest, mean: (starts,), mean squares over states, in variances, of
+    the model's error, of that of the last sample, and of that of the mean.
     """
 
     n_ahead: int
-    span_s: float
     r2: Float[np.ndarray, " n_states"]
     limit: Float[np.ndarray, " n_states"]
     error: Float[np.ndarray, " starts"]
@@ -241,7 +240,6 @@ def one_step(
     error, rest, mean = (np.nanmean(values[kept] / scale, axis=1) for values in squares)
     return OneStep(
         n_ahead=n_ahead,
-        span_s=n_ahead * records[0].dt_s,
         r2=1.0 - np.nansum(squares[0], axis=0) / spread,
         limit=1.0 - _noise_taken(along, n_ahead),
         error=error,

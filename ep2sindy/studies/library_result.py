@@ -23,7 +23,7 @@ from ep2sindy.studies.balance import ModelBalance
 from ep2sindy.studies.candidates import CandidateRow, selected_metrics
 from ep2sindy.studies.study import Coefficients
 from ep2sindy.studies.sustained import SUSTAINED_MODEL, SustainedModel
-from ep2sindy.studies.views import EVALUATED, EVALUATION, best_run, found_model, worst_run
+from ep2sindy.studies.views import EVALUATED, EVALUATION, best_run, found_model
 
 FROM_DERIVATIVES = (
     "Self-sustained models, which free runs select, are run over held-out time; the equations "
@@ -144,7 +144,7 @@ def find_best(results: Mapping[str, LibraryResult], n_records: int) -> Result:
             best, run, file=f"{best}_sustained", picture=picture, more=[Text(f"{found.note}.")],
             where="held-out time", held=found.constraint,
         )  # fmt: skip
-    runs = {name: worst_run(each.runs) for name, each in results.items()}
+    runs = {n: max(r.runs, key=lambda run: run.rank) for n, r in results.items()}
     best = best_run(runs)
     found, test = results[best].discovery, results[best].discovery.noise_test
     return found_model(

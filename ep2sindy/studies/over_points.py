@@ -124,15 +124,11 @@ def add_points(
     )
 
 
-def verdict(run: Evaluation) -> str:
-    """The status; one word for a run that follows the samples or sustains their oscillation."""
-    return str(Status.SUSTAINED if run.holds else run.status)
-
-
 def _rows(found: Mapping[str, Mapping[str, Fitted]]) -> pd.DataFrame:
     """One row per structure, way and point: what the figure draws."""
     rows = [
-        (fit.name, fit.way.name, point, verdict(fit.from_sample),
+        (fit.name, fit.way.name, point,
+         str(Status.SUSTAINED if fit.from_sample.holds else fit.from_sample.status),
          abs(worst_amplitude(fit.from_sample) - 1.0))
         for point, fits in found.items()
         for fit in fits.values()

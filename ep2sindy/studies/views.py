@@ -104,17 +104,8 @@ def terms_text(terms: Mapping[str, Sequence[str]]) -> str:
 
 def best_run(runs: Mapping[str, Evaluation]) -> str:
     """Name of the run of the best status, and of these the nearest to the data."""
-
-    def rank(name: str) -> tuple[int, float]:
-        nrmse = runs[name].nrmse
-        return runs[name].rank, nrmse if np.isfinite(nrmse) else np.inf
-
-    return min(runs, key=rank)
-
-
-def worst_run(runs: Sequence[Evaluation]) -> Evaluation:
-    """The first run of the worst status."""
-    return max(runs, key=lambda run: run.rank)
+    distances = {name: np.nan_to_num(run.nrmse, nan=np.inf) for name, run in runs.items()}
+    return min(runs, key=lambda name: (runs[name].rank, distances[name]))
 
 
 def found_model(
