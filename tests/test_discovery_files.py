@@ -115,3 +115,26 @@ def test_candidates_of_unknown_terms_are_refused() -> None:
     text = found("trajectories").to_json()
     with pytest.raises(ValueError, match="a candidate that is no equation of x"):
         ep.Discovery.from_json(text.replace('"x*y"\n     ]', '"x*q"\n     ]', 1))
+
+
+def test_a_discovery_says_what_is_said_of_its_model_also_once_it_is_read() -> None:
+    noise = np.random.default_rng(0).standard_normal((20, 2))
+    nothing = ep.discover((np.arange(20.0), noise))
+    assert repr(nothing).startswith("Discovery: no equations found")
+    found = ep.discover(ep.lotka_volterra().trajectory(noise=0.02, rng=0))
+    assert repr(found).startswith("Discovery of 2 equations: follows the samples for 99.9 s\n")
+    again = ep.Discovery.from_json(found.to_json())
+    assert again.evaluation is None
+    assert again.verdict == found.verdict == "follows the samples for 99.9 s"
+
+
+@pytest.mark.parametrize("how", [{}, {"shared": True}, {"law": 1}])
+def test_at_several_points_it_says_at_how_many(how) -> None:
+    runs = [
+        replace(ep.lotka_volterra(a=a).trajectory(noise=0.02, rng=0), parameters={"a": a})
+        for a in (0.5, 0.8, 1.1)
+    ]
+    found = ep.discover(runs, method=ep.Regression(), **how)
+    assert found.verdict == "follows the samples at 3 of 3"
+    again = ep.Discovery.from_json(found.to_json())
+    assert again.verdict == found.verdict

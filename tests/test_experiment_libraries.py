@@ -201,4 +201,4 @@ def test_a_state_that_shows_nothing_but_noise_has_no_law(tmp_path: Path) -> None
             "data.units={time: s}", "trajectory.states=[x]", f"output={tmp_path}",
         )
     )  # fmt: skip
-    assert "model: no law of any state" in " ".join(found.log.split())
+    assert "model: no equations found" in " ".join(found.log.split())

@@ -328,7 +328,7 @@ def test_hidden_states_that_explain_a_signal_end_the_list() -> None:
     assert attempt.found.model.terms("g") == pytest.approx(exact, rel=0.05)
     assert attempt.searched == ["g"]
     assert np.isnan(attempt.fraction)
-    assert free.is_similar
+    assert free.comparison.is_similar
     assert free.record.t[0] == signal.t[round(0.75 * len(signal.t)) - 1]
     assert states.state_names == ("x", "g")
     assert free.forecast is not None

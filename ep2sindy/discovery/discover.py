@@ -184,7 +184,9 @@ def _discover_together(
         terms = {s: [t for state, t in structure.coefficients if state == s] for s in task.states}
         task = replace(task, library=task.library.plain.only(terms))
     several = PointsProblem(task, points, method, structure)
-    return several.discover(law, rng=rng, progress=progress)
+    found = several.discover(law, rng=rng, progress=progress)
+    seen = {label: replace(own, records=points[label]) for label, own in found.points.items()}
+    return replace(found, points=seen)
 
 
 def _discover_point(

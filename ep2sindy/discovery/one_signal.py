@@ -342,8 +342,8 @@ def explains(found: Discovery, signal: str) -> bool:
         return False
     (record,), (path,) = found.estimate.runs, found.estimate.paths
     free = evaluate(found.estimate.model, record, initial=path[0], assessed=[signal])
-    if not free.is_similar or free.cycle is None:
-        return free.is_similar
+    if not free.comparison.is_similar or free.cycle is None:
+        return free.comparison.is_similar
     n_periods = float(record.t[-1] - record.t[0]) / free.cycle.period_s
     return bool(free.multiplier**n_periods < SPIRALS)
 

@@ -176,7 +176,7 @@ class Discovery:
     @cached_property
     def evaluation(self) -> Evaluation | None:
         """What is said of the model, by the records that it was found in; None without these."""
-        if not self.records or not self.model.coef.any():
+        if not self.records:
             return None
         states, found = self.model.states, self.estimate
         noise = np.zeros(len(states)) if found is None else found.noise_std
@@ -185,12 +185,25 @@ class Discovery:
 
     @property
     def verdict(self) -> str:
-        """What is said of the model, in a few words; see `Evaluation.heading`."""
-        if self.points:
-            words = [own.verdict for own in self.points.values()]
-            counts = Counter(word for word in words if word)
-            return ", ".join(f"{word} at {n}" for word, n in counts.most_common())
-        return self.judged if self.evaluation is None else self.evaluation.heading
+        """What is said of the model, in a few words; see `Evaluation.heading`.
+
+        Of several points, at how many of them what is said; by the law, if there is one.
+        """
+        if not self.points:
+            return self.judged if self.evaluation is None else self.evaluation.heading
+        words = Counter(self._said_at(own) for own in self.points.values())
+        counts = ", ".join(f"{word} at {n}" for word, n in words.most_common() if word)
+        return f"{counts} of {len(self.points)}" if counts else self.judged
+
+    def _said_at(self, own: Discovery) -> str:
+        """The status at a point, or that no equations were found."""
+        found = own.evaluation
+        if self.law is not None and own.records:
+            model = self.law.at(extrapolate=True, **own.records[0].parameters)
+            found = evaluate(model, own.records)
+        if found is None:
+            return ""
+        return "no equations found" if found.rival else str(found.status)
 
     @property
     def scores(self) -> dict[str, Float[np.ndarray, " _candidates"]]:
@@ -355,8 +368,9 @@ class Discovery:
             how = "one law" if self.law else "one support" if self._is_shared else "each alone"
             where = f" at {len(self.points)} operating points, {how}"
         n = len(self.model.states)
-        verdict = f": {self.verdict}" if self.verdict else ""
-        return f"Discovery of {n} equations{where}{verdict}"
+        if (verdict := self.verdict).startswith("no equations found") and not self.points:
+            return f"Discovery: {verdict}"
+        return f"Discovery of {n} equation{'s' * (n > 1)}{where}{verdict and f': {verdict}'}"
 
     @property
     def _is_shared(self) -> bool:

@@ -41,11 +41,12 @@ from ep2sindy.model.stability import (
 )
 from ep2sindy.runtime.screen import WIDTH, html_table, one_screen, text_table
 from ep2sindy.runtime.values import check_kind
-from ep2sindy.signals.attractor import follow_phase
+from ep2sindy.signals.attractor import LEAST_FOR_NOISE, follow_phase
 from ep2sindy.signals.spectrum import DECAYED, dominant_frequency
 
 IN_PHASE = 0.25  # periods, by which a run that is in phase may be ahead or behind
-STD, WIDEST = " standard deviations", len("amplitude ratio  ")
+STD, WIDEST = " standard deviations", 36  # columns of a table before the model's
+COLUMNS = ("quantity", "data", "model")
 # Times a record's size, from which and below which a run's is not reported; and of a period, of a
 # lag.
 LEFT, NOTHING, LEAST_SHOWN = 100.0, 1e-3, 0.01
@@ -125,15 +126,6 @@ class Evaluation:
     each: Sequence[Evaluation] = ()
 
     @property
-    def is_similar(self) -> bool:
-        """Whether the run is like the record.
-
-        It stays on the cycle, or, without a cycle to compare, it has the record's envelope, or its
-        means and amplitudes.
-        """
-        return self.comparison.is_similar
-
-    @property
     def f_error(self) -> float:
         """Relative error of the frequency; NaN if the run diverged, or without a period."""
         return self.comparison.f_error
@@ -157,6 +149,8 @@ class Evaluation:
         """The verdict by samples and cycle: the first of `Status` that holds."""
         if self.model.coef.any() and self.following.followed_s:
             return Status.FOLLOWS
+        if self.comparison.status is Status.NO_CYCLE:
+            return Status.DEPARTS
         if self.is_driven and self.comparison.status in CYCLIC:
             return Status.DEPARTS
         return self._stability if self.comparison.stays else self.comparison.status
@@ -188,7 +182,7 @@ class Evaluation:
         data = self.compared.cycle
         assert data is not None
         start, period_s = self.rollout.states[0], 1.0 / data.frequency_Hz
-        end = end_of_long_run(self.model, start, duration_s, period_s)
+        end = end_of_long_run(self.model, start, duration_s, period_s, self.compared.std)
         if end is None:
             return Status.NOT_TOLD
         late = replace(self.compared, t=end[0], states=end[1]).similarity(end[1], self.bounds)
@@ -239,9 +233,6 @@ class Evaluation:
     def run_text(self) -> str:
         """How the run from one sample compares with the record."""
         status = self.comparison.status
-        if status is Status.NO_CYCLE:
-            are = "are" if self.is_similar else "are not"
-            return f"{status}; its means and amplitudes {are} the record's"
         of = f" of {self.rollout.outside}" if self.rollout.outside else ""
         lasted = self.rollout.lasted_text if self.rollout.diverged else ""
         return f"{status}{of} after {lasted}" if lasted else str(status)
@@ -250,17 +241,17 @@ class Evaluation:
     def heading(self) -> str:
         """The verdict alone, in few words: by samples, by the cycle, and by forecasts."""
         if not self.model.coef.any():
-            return "no law of any state"
+            return "no equations found"
         if self.status is Status.FOLLOWS:
             return self.text
         if self.rival:
             return f"no equations found: {self.rival} forecasts better"
         forecasts = "" if self.forecast is None else self.forecast.text
-        own = str(self.comparison.status if self.status is Status.NO_CYCLE else self.status)
+        own = str(self.status)
         both = f"{own}; {forecasts}" if forecasts else self.text
-        if self.status is Status.NO_CYCLE and forecasts:
-            return forecasts
-        return both if len(both.split()) <= MOST_WORDS else forecasts if self.is_driven else own
+        if len(both.split()) <= MOST_WORDS:
+            return both
+        return forecasts if self.status is Status.DEPARTS else own
 
     @property
     def rank(self) -> int:
@@ -347,7 +338,7 @@ class Evaluation:
         """The closed orbit on which the run ends; None if it ends on none, or is driven."""
         if self.is_driven or self.rollout.diverged or self.comparison.status is Status.DECAYS:
             return None
-        frequency_Hz = np.nanmax(list(self.frequency_Hz.values()), initial=0.0)
+        frequency_Hz = max((f for f in self.frequency_Hz.values() if f == f), default=0.0)
         if not frequency_Hz > 0.0:
             return None
         return limit_cycle(self.model, self.rollout.states[-1], period_s=1.0 / frequency_Hz)
@@ -410,7 +401,7 @@ class Evaluation:
     @property
     def rest_texts(self) -> list[str]:
         """The rest points near the record, each in a line."""
-        known = self.rest_points[:N_SHOWN]
+        known = () if self.rival else self.rest_points[:N_SHOWN]
         return [f"rests at {each.text(self.model, self.rollout.clock)}" for each in known]
 
     @property
@@ -419,13 +410,19 @@ class Evaluation:
         frequency_Hz = self.frequency_Hz[self.model.states[0]]
         if not np.isfinite(frequency_Hz):
             return "-"
-        error = f" ({error_text(self.f_error)})" if np.isfinite(self.f_error) else ""
-        return f"{self.rollout.clock.frequency_text(frequency_Hz)}{error}"
+        clock, data = self.rollout.clock, self.compared.cycle
+        if data is None or not np.isfinite(self.f_error):
+            return clock.frequency_text(frequency_Hz)
+        own = clock.frequency_text(data.frequency_Hz * (1.0 + self.f_error))
+        return f"{own} ({error_text(self.f_error)})"
 
     @property
     def distance_text(self) -> str:
         """`x 1.02, y 0.98 times the noise`; empty for a run that no start keeps finite."""
-        known = {state: f"{d:.3g}" for state, d in self.distance.items() if d <= LEFT}
+        own = [self.model.states[k] for k in self.assessed]
+        known = {s: f"{self.distance[s]:.3g}" for s in own if self.distance[s] <= LEFT}
+        if self.record.n_samples < LEAST_FOR_NOISE:  # whose noise is not known
+            return ""
         return _listed(known, " times the noise of the samples")
 
     @property
@@ -444,51 +441,43 @@ class Evaluation:
             model = f"{own_std:.4g}{unit}" if own_std <= LEFT * std else f"over {LEFT:.0f} times"
             known = np.isfinite(own_std)
             rows.append((f"amplitude of {state}", f"{std:.4g}{unit}", model if known else "-"))
-        waveforms = [value for value in self.waveform_error.values() if np.isfinite(value)]
-        if waveforms and not self.is_driven:
-            rows.append(("waveform", "", f"within {max(waveforms):.2g}{STD}"))
+        waveform = max(self.waveform_error.values())
+        if np.isfinite(waveform) and not self.is_driven:
+            rows.append(("waveform", "", f"within {waveform:.2g}{STD}"))
         if self.phase_text and not self.is_driven:
             rows.append(("phase", "", self.phase_text))
-        elif np.isfinite(self.nrmse):
-            off = f"{size_text(self.nrmse)}{STD}"
+        off = f"{size_text(self.nrmse)}{STD}" if np.isfinite(self.nrmse) else ""
+        if self.status is Status.FOLLOWS:
+            rows.append(("distance", "", self.distance_text))
+        elif off and (self.is_driven or not self.phase_text):
             rows.append(("distance", "", "; ".join(filter(None, [off, self.distance_text]))))
         return rows
 
     @property
-    def rows(self) -> list[tuple[str, str]]:
-        """Quantities and their values, as text; computes what has not been asked for."""
-        clock = self.rollout.clock
-        frequencies = {s: clock.frequency_text(f) for s, f in self.frequency_Hz.items() if f == f}
-        error = f" ({error_text(self.f_error)})" if np.isfinite(self.f_error) else ""
-        compared = [
-            ("frequency", _listed(frequencies) + error),
-            ("amplitude ratio", _listed(_sizes(self.amplitude_ratio))),
-            ("waveform error", _listed(_texts(self.waveform_error), STD)),
-            ("phase", self.phase_text if np.isfinite(self.phase_end) else ""),
-            ("cycle", self.cycle_text),
-        ]
+    def rows(self) -> list[tuple[str, str, str]]:
+        """All that is said: quantity, data, model; computes what has not been asked for."""
         found = [
-            ("status", self.text),
-            ("distance", self.distance_text),
-            *([] if self.is_driven else compared),
-            *(("rests", text.removeprefix("rests ")) for text in self.rest_texts),
-            ("score", self.one_step.text if self.one_step else ""),
-            ("forecasts", "" if self.forecast is None else self.forecast.text),
-            ("missing", self.missing),
-            ("lack of fit", self.lack_of_fit),
+            ("status", "", self.text),
+            *self.table,
+            ("cycle", "", self.cycle_text),
+            *(("rests", "", text.removeprefix("rests ")) for text in self.rest_texts),
+            ("score", "", self.one_step.text if self.one_step else ""),
+            ("forecasts", "", "" if self.forecast is None else self.forecast.text),
+            ("missing", "", self.missing),
+            ("lack of fit", "", self.lack_of_fit if self.status is not Status.FOLLOWS else ""),
         ]
-        return [(name, value) for name, value in found if value]
+        return [row for row in found if row[2]]
 
     def __repr__(self) -> str:
-        rows = [
-            (name if k == 0 else "", line)
-            for name, value in self.rows
-            for k, line in enumerate(wrap(value, WIDTH - WIDEST))
+        lines = [
+            (name, data, line) if k == 0 else ("", "", line)
+            for name, data, model in self.rows
+            for k, line in enumerate(wrap(model, WIDTH - WIDEST))
         ]
-        return one_screen(text_table(["quantity", "value"], rows))
+        return one_screen(text_table(COLUMNS, lines))
 
     def _repr_html_(self) -> str:
-        return html_table(["quantity", "value"], [(n, escape(value)) for n, value in self.rows])
+        return html_table(COLUMNS, [[escape(cell) for cell in row] for row in self.rows])
 
 
 def evaluate(
@@ -588,14 +577,6 @@ def _evaluate(
         assessed=columns,
         forecasts=forecasts,
     )
-
-
-def _texts(values: Mapping[str, float]) -> dict[str, str]:
-    return {state: f"{value:.3g}" for state, value in values.items() if np.isfinite(value)}
-
-
-def _sizes(ratios: Mapping[str, float]) -> dict[str, str]:
-    return {state: size_text(ratio) for state, ratio in ratios.items() if np.isfinite(ratio)}
 
 
 def size_text(ratio: float, form: str = ".3g") -> str:

@@ -20,11 +20,14 @@ from ep2sindy.model.rollout import Rollout
 # A run follows samples if its distance from those of every state is at most the white noise there,
 # or this fraction of their standard deviation, if that is more. The noise is estimated: a distance
 # may exceed it by a tenth, and by two standard errors of a standard deviation.
-FLOOR, WITHIN, STANDARD_ERRORS = 1e-3, 1.1, 2.0
+# Of some state the noise is at most NOISY of its standard deviation: within more, a model at rest
+# would follow.
+FLOOR, WITHIN, STANDARD_ERRORS, NOISY = 1e-3, 1.1, 2.0, 0.4
 
 # A fitted start is not looked for any longer once a run is so many times the noise away over a part
 # of the record; runs that are restarted along a record.
-FAR, N_RESTARTS = 5.0, 40
+# A start is fitted to so many samples at most, or twice as many, and then only run on.
+FAR, N_RESTARTS, MOST_FITTED = 5.0, 40, 4000
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,10 +61,11 @@ class Following:
         is nearer. Infinite for a run that diverges.
         """
         along, own, nearest = self.restarts, list(self.assessed), np.full(len(self.unit), np.inf)
+        is_exact = bool((self.unit[own] <= FLOOR).all() and np.isfinite(along.samples[0]).all())
         if not self.rollout.diverged:
             off = (self.rollout.states - along.samples) / along.std
             nearest = np.sqrt(np.nanmean(np.square(off), axis=0)) / self.unit
-        if (nearest[own] <= self._bound).all() or (self.unit[own] <= FLOOR).all():
+        if is_exact or (nearest[own] <= self._bound).all():
             return nearest
         squares = [self._fitted_run(*piece) for piece in between_gaps(self.record.t)]
         fitted = np.sqrt(np.nanmean(np.concatenate(squares), axis=0))
@@ -72,20 +76,17 @@ class Following:
 
         Infinite if it is far from a part already, so that no start follows all of it.
         """
-        along = self.restarts
-        seen = np.flatnonzero(np.isfinite(along.samples[first : last - 1]).all(axis=1))
-        if not len(seen):
+        along, begin, whole = self.restarts, np.array([first]), last - 1 - first
+        if not whole:
             return np.full((1, len(self.unit)), np.nan)
-        begin = np.array([first + int(seen[0])])
-        whole = last - 1 - int(begin[0])
         n = min(self._per_turn, whole)
         start = along.fitted(begin, n)
         while True:
             squares = np.square(along.off(along.paths(start, begin, n), begin)[0] / self.unit)
             if n == whole or not np.nanmean(squares) <= FAR**2:
                 break
-            n = min(2 * n, whole)
-            start = along.nearer(begin, n, start)
+            n = min(2 * n, whole) if n < MOST_FITTED else whole
+            start = along.nearer(begin, n, start) if n <= 2 * MOST_FITTED else start
         return squares if n == whole else np.full((1, len(self.unit)), np.inf)
 
     @property
@@ -108,13 +109,15 @@ class Following:
         within the noise, from starts that are fitted to the turn.
         """
         own, t, n = list(self.assessed), self.record.t, self._per_turn
+        if not (self.unit[own] <= NOISY).any():
+            return 0.0  # coarse samples may be all that looks like noise
         if (self.distances[own] <= self._bound).all():
             return float(t[-1] - t[0])
         wanders = bool(self.model.inputs) or not self.compared.repeats
         if not wanders or spirals(self.compared.states) or 2 * n > len(t):
             return 0.0
         along = self.restarts
-        first = along.starts(n, N_RESTARTS)
+        first = along.starts(n, N_RESTARTS, measured=False)
         off = along.off(along.paths(along.fitted(first, n), first, n), first)
         distances = np.sqrt(np.nanmean(np.square(off), axis=(0, 1))) / self.unit
         is_near = len(first) > 1 and bool((distances <= self._bound)[own].all())

@@ -23,7 +23,8 @@ ACCURATE = 1e-7
 
 # What a start is moved by to see where its run goes, in standard deviations; and steps in which it
 # is fitted to the samples that follow.
-MOVED, N_FITTING = 1e-5, 6
+# They end once none of them takes a thousandth of what is left.
+MOVED, N_FITTING, SETTLED = 1e-5, 6, 0.999
 
 MOST_STARTS = 200  # along a record
 
@@ -33,7 +34,8 @@ LIMITED = 0.01
 
 # Error of a forecast, in standard deviations, that counts for one that has diverged; standard
 # errors from which a loss is no chance; and what noise takes that is not worth a word.
-WORST, SURELY, NOTHING = 10.0, 1.645, 1e-3
+# Farther than CLOSE above what noise is said to allow, coarse samples were taken for noise.
+WORST, SURELY, NOTHING, CLOSE = 10.0, 1.645, 1e-3, 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,19 +92,22 @@ class Restarts:
             off = step_error(
                 self._field, self.samples[some], self.record.t, self._drive, some, n, self._bound
             )
-            if np.nanmax(off / size, initial=0.0) <= ACCURATE:
+            if np.max(np.nan_to_num(off, nan=np.inf) / size, initial=0.0) <= ACCURATE:
                 break
             n *= 2
         return n
 
-    def starts(self, n_ahead: int, most: int = MOST_STARTS) -> Int[np.ndarray, " starts"]:
-        """Samples of all states that start a run of `n_ahead` samples without a gap, evenly spread.
+    def starts(
+        self, n_ahead: int, most: int = MOST_STARTS, *, measured: bool = True
+    ) -> Int[np.ndarray, " starts"]:
+        """Samples that start a run of `n_ahead` samples without a gap, evenly spread.
 
-        Empty if there is none.
+        measured: whether all states have to be measured there. Empty if there is none.
         """
         found = [np.arange(a, b - n_ahead) for a, b in between_gaps(self.record.t)]
         places = np.concatenate(found)
-        places = places[np.isfinite(self.samples[places]).all(axis=1)]
+        if measured:
+            places = places[np.isfinite(self.samples[places]).all(axis=1)]
         chosen = np.linspace(0, len(places) - 1, min(len(places), most)).round()
         return places[chosen.astype(np.int64)]
 
@@ -135,7 +140,7 @@ class Restarts:
         Sums of squares in standard deviations are least, over an eighth of the samples first, then
         over twice as many: in chaos, a run from a sample with noise is soon far from them.
         """
-        starts = self.samples[first]
+        starts = self.record.columns(self.model.states)[first]  # interpolated where not measured
         for n in sorted({max(1, n_ahead // part) for part in (8, 4, 2, 1)}):
             starts = self.nearer(first, n, starts)
         return starts
@@ -156,7 +161,10 @@ class Restarts:
             off = np.where(better[:, None], off, 0.0)
             cost = np.square(off[0]).mean(axis=1)
             better &= cost < least
-            best, least = np.where(better[:, None], starts, best), np.where(better, cost, least)
+            best = np.where(better[:, None], starts, best)
+            least, before = np.where(better, cost, least), least
+            if (least > SETTLED * before).all():
+                break
             slopes = ((off[1:] - off[0]) / MOVED).transpose(1, 0, 2)
             normal = slopes @ slopes.transpose(0, 2, 1) + 1e-12 * np.eye(d)
             step = np.linalg.solve(normal, slopes @ off[0][..., None])[..., 0] * self.std
@@ -200,7 +208,8 @@ class OneStep:
         """`0.981 over 3 samples; the noise allows 0.983`."""
         step = f"{self.n_ahead} sample{'s' * (self.n_ahead > 1)}"
         limit = float(self.limit.mean())
-        noise = f"; the noise allows {limit:.3f}" if limit < 1.0 - NOTHING else ""
+        is_known = limit < 1.0 - NOTHING and self.score < limit + CLOSE
+        noise = f"; the noise allows {limit:.3f}" if is_known else ""
         return f"{self.score:.3f} over {step}{noise}"
 
 
@@ -214,34 +223,41 @@ def one_step(
     Raises ValueError if no sample of all states is followed by such a step.
     """
     along = [Restarts(model, record) for record in records]
-    longest = min(record.n_samples for record in records) // 2
+    longest = max(record.n_samples for record in records) // 4
     if horizon_s is None:
         tried = np.unique(np.round(np.geomspace(1, max(1, longest), 40)).astype(np.int64)).tolist()
         n_ahead = next((n for n in tried if _stands_out(along, n)), tried[-1])
     else:
         n_ahead = max(1, round(horizon_s / records[0].dt_s))
-    off, change, level = [], [], []
+    off, change, level, left = [], [], [], []
     for each in along:
         if len(first := each.starts(n_ahead)):
-            paths = each.paths(each.samples[first], first, n_ahead)
-            off.append(np.minimum(np.abs(each.off(paths, first)[:, -1]), WORST) * each.std)
+            own, *moved = (
+                np.nan_to_num(each.paths(each.samples[first] + move, first, n_ahead), nan=np.inf)
+                for move in np.vstack([np.zeros(len(each.noise)), np.diag(each.noise)])
+            )
+            end, worst = own[:, -1], WORST * each.std
+            off.append(np.minimum(np.abs(end - each.samples[first + n_ahead]), worst))
+            with np.errstate(invalid="ignore"):  # of runs that diverge from either start
+                lost = [np.minimum(np.abs(path[:, -1] - end), worst) for path in moved]
+            left.append(np.square(each.noise) + np.nansum(np.square(lost), axis=0))
             change.append(each.samples[first + n_ahead] - each.samples[first])
             level.append(each.samples[first + n_ahead] - np.nanmean(each.samples, axis=0))
     if not off:
         raise ValueError(
             f"a forecast needs samples of all states {list(model.states)} that {n_ahead} samples "
-            f"without a gap follow, got none in {longest * 2} samples; ask for a shorter horizon_s"
+            f"without a gap follow, got none in {longest * 4} samples; ask for a shorter horizon_s"
         )
     squares = [np.square(np.concatenate(values)) for values in (off, change, level)]
     moves = np.concatenate(change)
-    spread = zero_to_one(np.nanvar(moves, axis=0) * np.isfinite(moves).sum(axis=0))
+    spread = zero_to_one(_variance(moves))
     scale = np.mean([np.square(each.std) for each in along], axis=0)
     kept = np.isfinite(squares[0]).any(axis=1)  # something was measured at the end of the step
     error, rest, mean = (np.nanmean(values[kept] / scale, axis=1) for values in squares)
     return OneStep(
         n_ahead=n_ahead,
-        r2=1.0 - np.nansum(squares[0], axis=0) / spread,
-        limit=1.0 - _noise_taken(along, n_ahead),
+        r2=1.0 - _variance(squares[0], of_squares=True) / spread,
+        limit=1.0 - np.concatenate(left).mean(axis=0) / spread,
         error=error,
         rest=rest,
         mean=mean,
@@ -251,7 +267,7 @@ def one_step(
 def _stands_out(along: Sequence[Restarts], n_ahead: int) -> bool:
     """Whether every state changes over a step by far more than its noise, or by as much as ever."""
     changes, size = _changes(along, n_ahead), np.mean([np.square(e.std) for e in along], axis=0)
-    is_wide = np.nanvar(changes, axis=0) >= size
+    is_wide = _variance(changes) >= size
     return bool((is_wide | (_noise_taken(along, n_ahead) <= LIMITED)).all())
 
 
@@ -262,4 +278,16 @@ def _changes(along: Sequence[Restarts], n_ahead: int) -> Float[np.ndarray, "chan
 def _noise_taken(along: Sequence[Restarts], n_ahead: int) -> Float[np.ndarray, " n_states"]:
     """Fraction of the variance of changes over a step that is noise of its start and its end."""
     noise = 2.0 * np.mean([np.square(each.noise) for each in along], axis=0)
-    return np.minimum(noise / zero_to_one(np.nanvar(_changes(along, n_ahead), axis=0)), 1.0)
+    return np.minimum(noise / zero_to_one(_variance(_changes(along, n_ahead))), 1.0)
+
+
+def _variance(
+    values: Float[np.ndarray, "rows n_states"], *, of_squares: bool = False
+) -> Float[np.ndarray, " n_states"]:
+    """Variance of the known values in every column, or mean of known squares; zero of none."""
+    known = np.isfinite(values)
+    n = np.maximum(known.sum(axis=0), 1)
+    mean = np.where(known, values, 0.0).sum(axis=0) / n
+    if of_squares:
+        return mean
+    return np.where(known, np.square(values - mean), 0.0).sum(axis=0) / n

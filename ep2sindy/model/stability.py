@@ -292,19 +292,20 @@ def end_of_long_run(
     start: Float[np.ndarray, " n_states"],
     duration_s: float,
     period_s: float,
+    scale: Float[np.ndarray, " n_states"],
 ) -> tuple[Float[np.ndarray, " samples"], Float[np.ndarray, "samples n_states"]] | None:
     """Times and states at the end of a long run by LSODA; None if it diverges or gives up.
 
-    It goes on for twenty periods after the duration, with 64 samples in each. LSODA is another
-    solver than that of `SparseModel.rollout`, whose errors might keep a run on a cycle.
+    It goes on for twenty periods after the duration, with 64 samples in each. scale: of the states.
+    LSODA is another solver than that of `SparseModel.rollout`, whose errors might keep a run on a
+    cycle.
     """
     from scipy.integrate import solve_ivp
 
     n = N_END * N_SAMPLES_AT_END
     t = duration_s + period_s * np.arange(n) / N_SAMPLES_AT_END
-    scale = zero_to_one(np.abs(start))
     scaled = Driven(model.field.scaled(scale))
-    bound = BLOW_UP * np.sqrt(len(start))
+    bound = BLOW_UP * (np.linalg.norm(start / scale) + np.sqrt(len(start)))
 
     def blown_up(_: float, y: np.ndarray) -> float:
         return float(np.linalg.norm(y)) - bound
@@ -315,7 +316,7 @@ def end_of_long_run(
             scaled, (0.0, t[-1]), start / scale, method="LSODA", t_eval=t, events=blown_up,
             rtol=LONG_RTOL, atol=LONG_RTOL,
         )  # fmt: skip
-    if not found.success or found.y.shape[1] < n or not np.isfinite(found.y).all():
+    if not found.success or len(found.t) < n or not np.isfinite(found.y).all():
         return None
     return t, found.y.T * scale
 
