@@ -94,7 +94,7 @@ def test_a_page_shows_the_result_on_the_first_screen(
         assert [url for url in found.asked if not url.startswith("data:")] == [page.as_uri()]
         assert (found.console, found.empty) == ([], 0)
         assert found.scroll_px <= width_px  # what is wider scrolls in itself
-        assert found.answers["heading"].startswith(("Found", "Simulated", "Nothing"))
+        assert 2 < len(found.answers["heading"].split()) <= 12
         assert found.answers["ends"] < n_screens * SCREEN_PX, (width_px, found.answers)
         if found.answers["equations"]:
             assert "STIX Two Math in part" in found.answers["math"]

@@ -112,9 +112,13 @@ def _is_number(value: Any) -> bool:
 
 
 def _lines(blocks: Sequence[Block]) -> int:
-    """How many lines these texts and equations take on a wide page."""
+    """How many lines these texts, equations and tables take on a wide page.
+
+    Tables stand side by side, with four rows in the height of three lines.
+    """
     texts = [block.text for block in blocks if isinstance(block, (Text, Equation))]
-    return sum(-(-len(text) // CHARACTERS) for text in texts)
+    rows = max((len(block.rows) + 2 for block in blocks if isinstance(block, Table)), default=0)
+    return sum(-(-len(text) // CHARACTERS) for text in texts) + 3 * rows // 4
 
 
 def _classes(table: Table, row: int) -> str:
