@@ -199,8 +199,8 @@ class Discovery:
         """The status at a point, or that no equations were found."""
         found = own.evaluation
         if self.law is not None and own.records:
-            model = self.law.at(extrapolate=True, **own.records[0].parameters)
-            found = evaluate(model, own.records)
+            at = own.records[0].parameters
+            found = evaluate(self.law.at(extrapolate=True, **at), own.records)
         if found is None:
             return ""
         return "no equations found" if found.rival else str(found.status)

@@ -52,14 +52,8 @@ COLUMNS = ("quantity", "data", "model")
 LEFT, NOTHING, LEAST_SHOWN = 100.0, 1e-3, 0.01
 N_SHOWN = 4  # most states, and most rest points, that the table shows one by one
 
-# What a comparison with a cycle says of a run, which says nothing of a model under inputs.
-CYCLIC = (
-    Status.SUSTAINED,
-    Status.WRONG_FREQUENCY,
-    Status.WRONG_CYCLE,
-    Status.NO_CYCLE,
-    Status.DECAYS,
-)
+# How a run ends, whatever drives it.
+ENDS = (Status.NEGATIVE, Status.LEAVES_DOMAIN, Status.DIVERGES)
 MOST_WORDS = 11  # of a verdict, so that its heading has twelve with a name
 
 # A cycle attracts if its multiplier lies below one by this many standard errors, and if runs of
@@ -149,11 +143,10 @@ class Evaluation:
         """The verdict by samples and cycle: the first of `Status` that holds."""
         if self.model.coef.any() and self.following.followed_s:
             return Status.FOLLOWS
-        if self.comparison.status is Status.NO_CYCLE:
+        compared = self.comparison.status
+        if compared is Status.NO_CYCLE or (self.is_driven and compared not in ENDS):
             return Status.DEPARTS
-        if self.is_driven and self.comparison.status in CYCLIC:
-            return Status.DEPARTS
-        return self._stability if self.comparison.stays else self.comparison.status
+        return self._stability if self.comparison.stays else compared
 
     @property
     def holds(self) -> bool:
@@ -418,12 +411,12 @@ class Evaluation:
 
     @property
     def distance_text(self) -> str:
-        """`x 1.02, y 0.98 times the noise`; empty for a run that no start keeps finite."""
-        own = [self.model.states[k] for k in self.assessed]
-        known = {s: f"{self.distance[s]:.3g}" for s in own if self.distance[s] <= LEFT}
-        if self.record.n_samples < LEAST_FOR_NOISE:  # whose noise is not known
+        """`x 1.02, y 0.98 times the noise of the samples`; empty where that is not known."""
+        own = [(self.model.states[k], self.following.distances[k]) for k in self.assessed]
+        known = [f"{state} {off:.3g}" for state, off in own if off <= LEFT][:N_SHOWN]
+        if not known or self.record.n_samples < LEAST_FOR_NOISE:
             return ""
-        return _listed(known, " times the noise of the samples")
+        return f"{', '.join(known)} times the noise of the samples"
 
     @property
     def table(self) -> list[tuple[str, str, str]]:
@@ -589,12 +582,3 @@ def size_text(ratio: float, form: str = ".3g") -> str:
 def error_text(error: float) -> str:
     """A relative error in percent, `+1.2 %`, or `0.00 %` for a smaller one."""
     return f"{100.0 * error:+.2g} %" if abs(error) >= 5e-5 else "0.00 %"
-
-
-def _listed(texts: Mapping[str, str], unit: str = "") -> str:
-    """`x 1.01, y 0.99`, of the first states if there are many; empty without any."""
-    shown = [f"{state} {text}" for state, text in texts.items()]
-    left = len(shown) - N_SHOWN
-    return (
-        ", ".join(shown[:N_SHOWN]) + (f" and {left} more" if left > 0 else "") + unit * bool(shown)
-    )

@@ -105,10 +105,6 @@ class ForecastSkill:
         return MappingProxyType({name: root_mean(each) for name, each in self.squared.items()})
 
     @property
-    def n_starts(self) -> int:
-        return len(self.squared[MODEL])
-
-    @property
     def rival(self) -> str:
         """The baseline that counts: the autoregression, or persistence if there is none."""
         return AUTOREGRESSION if AUTOREGRESSION in self.nrmse else PERSISTENCE
@@ -159,17 +155,15 @@ class ForecastSkill:
     @property
     def better_periods(self) -> tuple[float, float] | None:
         """From where to where it does, in periods, or in samples without an oscillation."""
-        return self._in_units(self.better)
+        return None if self.better is None else self._in_units(self.better)
 
-    def _in_units(self, span: tuple[int, int] | None) -> tuple[float, float] | None:
-        if span is None:
-            return None
+    def _in_units(self, span: tuple[int, int]) -> tuple[float, float]:
         first, last = span
         return (self._ahead(first - 1) if first else 0.0), self._ahead(last)
 
     def _span(self, span: tuple[int, int]) -> str:
         """`from 0.3 to 4 periods`, or `up to 1 period`."""
-        begin, end = self._in_units(span) or (0.0, 0.0)
+        begin, end = self._in_units(span)
         unit = self.unit.removesuffix("s") if end == 1.0 else self.unit
         return f"from {begin:.2g} to {end:.2g} {unit}" if begin else f"up to {end:.2g} {unit}"
 

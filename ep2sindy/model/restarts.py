@@ -197,11 +197,9 @@ class OneStep:
     @property
     def rival(self) -> str:
         """What forecasts clearly better than the model, in words; empty if neither does."""
-        for words, rival in (("the last sample", self.rest), ("the mean", self.mean)):
-            loss = self.error - rival
-            if loss.mean() > SURELY * loss.std() / np.sqrt(len(loss)):
-                return words
-        return ""
+        losses = {"the last sample": self.error - self.rest, "the mean": self.error - self.mean}
+        surely = SURELY / np.sqrt(len(self.error))
+        return next((name for name, x in losses.items() if x.mean() > surely * x.std()), "")
 
     @property
     def text(self) -> str:
@@ -250,13 +248,13 @@ def one_step(
         )
     squares = [np.square(np.concatenate(values)) for values in (off, change, level)]
     moves = np.concatenate(change)
-    spread = zero_to_one(_variance(moves))
+    spread, n_known = zero_to_one(_variance(moves)), np.isfinite(moves).sum(axis=0)
     scale = np.mean([np.square(each.std) for each in along], axis=0)
     kept = np.isfinite(squares[0]).any(axis=1)  # something was measured at the end of the step
     error, rest, mean = (np.nanmean(values[kept] / scale, axis=1) for values in squares)
     return OneStep(
         n_ahead=n_ahead,
-        r2=1.0 - _variance(squares[0], of_squares=True) / spread,
+        r2=1.0 - np.nansum(squares[0], axis=0) / np.maximum(n_known, 1) / spread,
         limit=1.0 - np.concatenate(left).mean(axis=0) / spread,
         error=error,
         rest=rest,
@@ -281,13 +279,9 @@ def _noise_taken(along: Sequence[Restarts], n_ahead: int) -> Float[np.ndarray, "
     return np.minimum(noise / zero_to_one(_variance(_changes(along, n_ahead))), 1.0)
 
 
-def _variance(
-    values: Float[np.ndarray, "rows n_states"], *, of_squares: bool = False
-) -> Float[np.ndarray, " n_states"]:
-    """Variance of the known values in every column, or mean of known squares; zero of none."""
+def _variance(values: Float[np.ndarray, "rows n_states"]) -> Float[np.ndarray, " n_states"]:
+    """Variance of the known values in every column; zero of none."""
     known = np.isfinite(values)
     n = np.maximum(known.sum(axis=0), 1)
     mean = np.where(known, values, 0.0).sum(axis=0) / n
-    if of_squares:
-        return mean
     return np.where(known, np.square(values - mean), 0.0).sum(axis=0) / n

@@ -10,7 +10,7 @@ import pandas as pd
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.figures.series import forecast_figure
-from ep2sindy.forecasting.skill import ForecastSkill, forecast_skill
+from ep2sindy.forecasting.skill import MODEL, ForecastSkill, forecast_skill
 from ep2sindy.model.model import SparseModel
 from ep2sindy.report.report import Report
 from ep2sindy.runtime.progress import SILENT, Progress
@@ -74,6 +74,6 @@ def _note(skill: ForecastSkill) -> str:
     steps = " Baselines take the samples interpolated onto equal steps." if skill.resampled else ""
     fitted = ", although the model was fitted to all of the record" if skill.seen else ""
     return (
-        f"{skill.n_starts} starts, whose states are estimated from the past alone{fitted}; {held}."
+        f"{len(skill.squared[MODEL])} starts, whose states are estimated from the past alone{fitted}; {held}."
         f"{steps}"
     )

@@ -149,17 +149,14 @@ class Study:
         self._report_choice(signal, best, skill, report, linear=linear)
         seen = len(best.states.signal.t) == len(signal.t)
         where = "all of it, too short to hold out" if seen else "its end, which was not fitted"
-        data_warnings = []
-        is_sustained = free.holds and not question
-        if is_sustained and (data_warning := report_unknown_drive(signal)):
-            data_warnings.append(Text(data_warning))
+        unknown = report_unknown_drive(signal) if free.holds and not question else None
         report.found(
             found_model(
                 signal.name,
                 free,
                 file=NAME,
                 picture=f"free_run_{NAME}",
-                more=data_warnings,
+                more=[Text(unknown)] if unknown else [],
                 where=where,
                 seen=seen,
                 lack_of_fit=best.found.lack_of_fit,
