@@ -73,7 +73,5 @@ def _note(skill: ForecastSkill) -> str:
         )
     steps = " Baselines take the samples interpolated onto equal steps." if skill.resampled else ""
     fitted = ", although the model was fitted to all of the record" if skill.seen else ""
-    return (
-        f"{len(skill.squared[MODEL])} starts, whose states are estimated from the past alone{fitted}; {held}."
-        f"{steps}"
-    )
+    n = len(skill.squared[MODEL])
+    return f"{n} starts, whose states are estimated from the past alone{fitted}; {held}.{steps}"
