@@ -1,5 +1,7 @@
 """What a sentence about forecasts says: better than an autoregression, or nothing of the kind."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -31,6 +33,8 @@ def test_a_gain_at_all_horizons_is_reported() -> None:
     assert found.text == "better than an autoregression up to 2 periods"
     assert found.better_periods == (0.0, 2.0)
     assert found.nearest_text == "Least error: the model up to 2 periods."
+    seen = replace(found, seen=True)  # by the search
+    assert seen.text == "better than an autoregression (in sample) up to 2 periods"
 
 
 def test_a_gain_is_reported_from_the_horizon_where_it_begins_to_where_it_ends() -> None:

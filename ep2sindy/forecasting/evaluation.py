@@ -163,23 +163,24 @@ class Evaluation:
         """What becomes of a run that stays on the record's cycle as long as this was recorded."""
         cycle, length_s = self.cycle, float(self.record.t[-1] - self.record.t[0])
         if cycle is None:
-            return self._after(RELAXATIONS * length_s)
+            return Status.SUSTAINED if self._stays(RELAXATIONS * length_s) else Status.WRONG_CYCLE
         if cycle.stability != "attracting":
             return Status.NEUTRAL if cycle.stability == "neutral" else Status.REPELLING
         needed_s = RELAXATIONS * cycle.relaxation_s
         surely = 1.0 - self.multiplier > ERRORS * multiplier_error(cycle)
-        return Status.SUSTAINED if surely and needed_s <= length_s else self._after(needed_s)
+        if (surely and needed_s <= length_s) or self._stays(needed_s):
+            return Status.SUSTAINED
+        return Status.NOT_TOLD if cycle.relaxation_s > length_s else Status.WRONG_CYCLE
 
-    def _after(self, duration_s: float) -> Status:
-        """Sustained, if another solver stays on the record's cycle for so long; else not told."""
+    def _stays(self, duration_s: float) -> bool:
+        """Whether another solver, from the record's start, stays on its cycle for so long."""
         data = self.compared.cycle
         assert data is not None
         start, period_s = self.rollout.states[0], 1.0 / data.frequency_Hz
         end = end_of_long_run(self.model, start, duration_s, period_s, self.compared.std)
         if end is None:
-            return Status.NOT_TOLD
-        late = replace(self.compared, t=end[0], states=end[1]).similarity(end[1], self.bounds)
-        return Status.SUSTAINED if late.stays else Status.NOT_TOLD
+            return False
+        return replace(self.compared, t=end[0], states=end[1]).similarity(end[1], self.bounds).stays
 
     @cached_property
     def following(self) -> Following:
@@ -441,7 +442,8 @@ class Evaluation:
             rows.append(("phase", "", self.phase_text))
         off = f"{size_text(self.nrmse)}{STD}" if np.isfinite(self.nrmse) else ""
         if self.status is Status.FOLLOWS:
-            rows.append(("distance", "", self.distance_text))
+            off = self.distance_text
+            rows += [("distance", "", off)] if off else []
         elif off and (self.is_driven or not self.phase_text):
             rows.append(("distance", "", "; ".join(filter(None, [off, self.distance_text]))))
         return rows

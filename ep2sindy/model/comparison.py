@@ -42,14 +42,14 @@ class Status(StrEnum):
     - sustained: a run from the record's start stays on the record's cycle, and this attracts.
     - not told: the run stays on it, but the cycle attracts too slowly for the record to show it.
     - neutral, repelling: the run stays on it, but perturbations of the cycle stay, or grow.
-    - departs from the samples: by more than their noise, of a record with inputs, which set what
-      oscillates, so that there is no cycle of the model's own to compare.
+    - departs from the samples: by more than their noise. There is no cycle of the model's own to
+      compare, since inputs set what oscillates, or the record does not repeat one.
     - wrong frequency: amplitudes and waveform are the record's, and the frequency is not, or the
       run misses the record in the first period already.
     - wrong cycle: the run oscillates with other amplitudes or another waveform.
-    - no cycle to compare: the record grows, decays or does not repeat itself. `is_similar` states
-      whether the run has its envelope, or its means and amplitudes; `Evaluation.forecast` states
-      how far the model forecasts such a record.
+    - no cycle to compare, of a `Comparison` alone: the record grows, decays or does not repeat
+      itself. `Comparison.is_similar` states whether the run has its envelope, or its means and
+      amplitudes.
     - decays, turns negative, leaves the domain (of a function of the model), diverges.
     """
 
@@ -106,7 +106,9 @@ class Comparison:
     """Comparison of one run with the cycle of a record, or with its statistics without one.
 
     status: SUSTAINED says that the run stays within the bounds of the cycle; whether it would stay
-    for longer, `Evaluation.status` finds out. The other fields are those of `Evaluation`.
+    for longer, `Evaluation.status` finds out. is_similar: whether the run is like the record: it
+    stays on the cycle or, without one, has the record's envelope, or its means and amplitudes.
+    f_error, by_state: as the fields of `Evaluation`.
     """
 
     status: Status
