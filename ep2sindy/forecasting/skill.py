@@ -49,7 +49,6 @@ PERIODS_AHEAD = 4.0  # longest horizon
 NEARER = 0.9  # fraction of the model's error below which a baseline is clearly nearer
 FEWEST = 0.1  # fraction of the horizons from which a span that begins later counts: many are tried
 EARLY = 0.25  # periods, over which a forecast must not be worse than the last sample or the mean
-TINY = 1e-12  # of the variance: rounding
 MODEL, MEAN = "model", "mean"
 WORDS = {
     MODEL: "the model",
@@ -172,18 +171,16 @@ class ForecastSkill:
         """What forecasts the first horizons better than the model; empty if nothing simple does.
 
         It is the last sample or the mean of the record, over the first quarter of a period, or a
-        sixteenth of all horizons, by more than chance makes in a case of twenty. Logarithms of the
-        errors are compared, so that starts where all is easy to foresee count as much.
+        sixteenth of all horizons, by more than chance makes in a case of twenty.
         """
         early = self.horizons_s <= EARLY * self.period_s
         early |= np.arange(len(early)) < max(1, len(early) // 16)
         own, last = self.squared[MODEL][:, early].mean(axis=1), int(np.flatnonzero(early)[-1])
         rivals = {
-            "the last sample": np.maximum(self.squared[PERSISTENCE][:, early].mean(axis=1), TINY),
+            "the last sample": self.squared[PERSISTENCE][:, early].mean(axis=1),
             "the mean": np.ones(len(own)),
         }
-        loss = {name: np.log(np.maximum(own, TINY) / each) for name, each in rivals.items()}
-        lost = [name for name, each in loss.items() if self._exceeds(each, last, SURE)]
+        lost = [name for name, each in rivals.items() if self._exceeds(own - each, last, SURE)]
         return lost[0] if lost else ""
 
     @property
