@@ -190,7 +190,7 @@ class DiscoveryProblem:
         roles = self.facts.roles
         check_repeats(self.runs, coupled=roles is not None)
         if roles is not None:
-            roles.processes(self.library, self.states)
+            self.at_point.facts.roles.processes(self.library, self.states)
             for state in roles.positive:
                 check_nonnegative(state, [run.columns([state])[:, 0] for run in self.runs])
         for state in (*self.facts.excluded, *(state for state, _ in self.facts.places)):
@@ -208,9 +208,19 @@ class DiscoveryProblem:
         return (*self.runs[0].state_names, *self.hidden)
 
     @property
+    def made(self) -> set[str]:
+        """The states that were made of others, whose known equations define them."""
+        return self.facts.made & {*self.states}
+
+    @property
+    def at_point(self) -> Library:
+        """The library with what is known at the operating point of the first run."""
+        return self.library.at_operating_point(self.runs[0].parameters)
+
+    @property
     def relations(self) -> Sequence[Relation]:
         """Between coefficients, at the operating point of the first run."""
-        return self.library.at_operating_point(self.runs[0].parameters).facts.relations
+        return self.at_point.facts.relations
 
     @property
     def theta(self) -> Float[np.ndarray, "samples terms"]:

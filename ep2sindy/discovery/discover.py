@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import chain, count, islice
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,12 +18,17 @@ from ep2sindy.discovery.method import TrajectorySearch, of_means
 from ep2sindy.discovery.result import Discovery, DiscoveryMethod, join_points
 from ep2sindy.library.library import Library, polynomial
 from ep2sindy.operating.law import LawFunctions
-from ep2sindy.operating.records import group_by_point, most_central, values_of
+from ep2sindy.operating.records import group_by_point, values_of
 from ep2sindy.runtime.parallel import SURROUNDING, Workers, collect
 from ep2sindy.runtime.progress import SILENT, Progress, as_progress
 from ep2sindy.runtime.threads import one_thread
 from ep2sindy.runtime.values import check_count, check_kind
 from ep2sindy.signals.signal import average_long
+
+if TYPE_CHECKING:
+    from ep2sindy.discovery.several_points import LawSearch
+
+    AnyLaw = LawFunctions | Sequence[LawFunctions] | LawSearch
 
 
 @one_thread()
@@ -31,7 +37,7 @@ def discover(
     library: Library | None = None,
     method: DiscoveryMethod | None = None,
     *,
-    law: LawFunctions | Sequence[LawFunctions] | None = None,
+    law: AnyLaw | None = None,
     shared: bool = False,
     hidden: Sequence[str] | int = (),
     t: object = None,
@@ -136,7 +142,7 @@ def discover(
     task = DiscoveryProblem(trajectories, library, hidden)
     rng, watch = np.random.default_rng(seed), as_progress(progress)
     if shared or law is not None:
-        found = _discover_together(task, method, law, rng, watch)
+        found = _discover_together(task, method, law, workers or SURROUNDING, rng, watch)
     elif all(run.parameters == task.runs[0].parameters for run in task.runs):
         found = _discover_point((task, rng), method=method, progress=watch)
     else:
@@ -167,26 +173,18 @@ def _points_of(task: DiscoveryProblem) -> Mapping[str, Sequence[Trajectory]]:
 def _discover_together(
     task: DiscoveryProblem,
     method: DiscoveryMethod,
-    law: LawFunctions | Sequence[LawFunctions] | None,
+    law: AnyLaw | None,
+    workers: Workers,
     rng: np.random.Generator,
     progress: Progress,
 ) -> Discovery:
-    """One support for all points, and the law of its coefficients if one is asked for."""
-    # This loads torch, only for a law or a support of several operating points.
-    from ep2sindy.discovery.several_points import PointsProblem
+    """One structure for all points, and the law of its coefficients if one is asked for."""
+    # This loads torch, only for a law or a structure of several operating points.
+    from ep2sindy.discovery.several_points import LawSearch, PointsProblem
 
-    points, structure = _points_of(task), None
-    if task.facts.roles is not None:
-        middle = list(points.values())[most_central(values_of(points))]
-        one = replace(task, runs=middle)
-        structure = _discover_point((one, rng), method=method).constraint
-        assert structure is not None
-        terms = {s: [t for state, t in structure.coefficients if state == s] for s in task.states}
-        task = replace(task, library=task.library.plain.only(terms))
-    several = PointsProblem(task, points, method, structure)
-    found = several.discover(law, rng=rng, progress=progress)
-    seen = {label: replace(own, records=points[label]) for label, own in found.points.items()}
-    return replace(found, points=seen)
+    asked = law if law is None or isinstance(law, LawSearch) else LawSearch(law)
+    several = PointsProblem(task, _points_of(task), method, asked, workers)
+    return several.discover(rng=rng, progress=progress)
 
 
 def _discover_point(
@@ -196,6 +194,7 @@ def _discover_point(
     progress: Progress = SILENT,
 ) -> Discovery:
     task, rng = piece
+    task = replace(task, library=task.at_point) if task.facts.roles else task
     found = method.identify(task, rng=rng, progress=progress)
     test = assess_noise(found, task.runs)
     # Intervals of a model that does not explain the data would not cover the truth.

@@ -24,7 +24,6 @@ from ep2sindy.discovery.result import Discovery
 from ep2sindy.estimation.cost import check_limit_s
 from ep2sindy.estimation.estimate import Estimate, ScoredSupport, estimate
 from ep2sindy.library.library import Library
-from ep2sindy.library.roles import Roles
 from ep2sindy.regression.ambiguity import Ambiguity, ambiguities, few_rows, find_ambiguities
 from ep2sindy.regression.bootstraps import Bootstraps, Resamples, Supports, draw_resamples, pool
 from ep2sindy.regression.formulations import WeightedWeak
@@ -311,7 +310,7 @@ class Regression:
             fronts = [equation.front for equation in equations]
             choice = self.choose(fronts, task, progress=progress)
         else:
-            choice = self._choose_under(task.facts.roles, task, rng=rng, progress=progress)
+            choice = self._choose_under(task, rng=rng, progress=progress)
         found: list[Ambiguity] = []
         for rows in dict.fromkeys(front.rows for front in choice.fronts.values()):
             # Known equations are not searched, so too few rows do no harm to them.
@@ -322,7 +321,7 @@ class Regression:
         return replace(choice, ambiguities=tuple(dict.fromkeys(found)), data_warnings=data_warnings)
 
     def _choose_under(
-        self, roles: Roles, task: DiscoveryProblem, *, rng: np.random.Generator, progress: Progress
+        self, task: DiscoveryProblem, *, rng: np.random.Generator, progress: Progress
     ) -> Discovery:
         """Search all equations at once for systems that keep the roles, and let the rule decide.
 
@@ -340,7 +339,7 @@ class Regression:
         library = task.library.with_known_terms(task.states)
         with progress.stage(None, "", "rows of the regression"):
             problems = self.formulation.assemble(task.runs, library, rng=rng)
-        systems = search_conserving_systems(problems, task, roles, self.search, depth=self.depth)
+        (systems,) = search_conserving_systems([(task, problems)], self.search, depth=self.depth)
         decision = self.selection.assess(systems, task.runs, progress=progress)
         provenance = self.provenance | _labels(task)
         return choose_system(systems.fronts, decision, self, task.runs, provenance=provenance)

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -35,6 +35,9 @@ from ep2sindy.runtime.files import write_text
 from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.runtime.screen import N_LINES, one_screen, sentences
 from ep2sindy.selection.criteria import OtherSystem, Selection
+
+if TYPE_CHECKING:
+    from ep2sindy.operating.left_out import LawChoice
 
 FORMAT = "ep2sindy.Discovery/1"
 
@@ -142,6 +145,8 @@ class Discovery:
         "V_D_V=300, mdot_mg_s=5". The model and all else are then those of the most central point.
     law : OperatingLaw, optional
         The law of all coefficients over the operating points, if it was asked for.
+    law_choice : LawChoice, optional
+        How the law was chosen, and its runs at points left out. None without a law.
     records : sequence of Trajectory, default ()
         The samples that the model is judged by, hidden states among them as they were estimated.
     judged : str, default ''
@@ -170,6 +175,7 @@ class Discovery:
     others: Sequence[OtherSystem] = field(default=(), repr=False)
     points: Mapping[str, Discovery] = field(default_factory=dict, repr=False)
     law: OperatingLaw | None = field(default=None, repr=False)
+    law_choice: LawChoice | None = field(default=None, repr=False)
     records: Sequence[Trajectory] = field(default=(), repr=False)
     judged: str = ""
 
@@ -191,19 +197,12 @@ class Discovery:
         """
         if not self.points:
             return self.judged if self.evaluation is None else self.evaluation.heading
-        words = Counter(self._said_at(own) for own in self.points.values())
+        found = [own.evaluation for own in self.points.values()]
+        if self.law_choice is not None:
+            found = [*self.law_choice.fitted]
+        words = Counter(_said(each) for each in found if each is not None)
         counts = ", ".join(f"{word} at {n}" for word, n in words.most_common() if word)
         return f"{counts} of {len(self.points)}" if counts else self.judged
-
-    def _said_at(self, own: Discovery) -> str:
-        """The status at a point, or that no equations were found."""
-        found = own.evaluation
-        if self.law is not None and own.records:
-            at = own.records[0].parameters
-            found = evaluate(self.law.at(extrapolate=True, **at), own.records)
-        if found is None:
-            return ""
-        return "no equations found" if found.rival else str(found.status)
 
     @property
     def scores(self) -> dict[str, Float[np.ndarray, " _candidates"]]:
@@ -383,14 +382,20 @@ class Discovery:
         )
 
 
+def _said(found: Evaluation) -> str:
+    """The status at a point, or that no equations were found."""
+    return "no equations found" if found.rival else str(found.status)
+
+
 def join_points(
     points: Mapping[str, Discovery],
     values: Float[np.ndarray, "points parameters"],
-    law: OperatingLaw | None = None,
+    choice: LawChoice | None = None,
 ) -> Discovery:
     """The discoveries of all points as one, which shows that of the most central point."""
     central = list(points.values())[most_central(values)]
-    return replace(central, points=points, law=law)
+    law = None if choice is None else choice.law
+    return replace(central, points=points, law=law, law_choice=choice)
 
 
 # Fields of a Discovery that are stored next to the model, and the kind of each or of its values.

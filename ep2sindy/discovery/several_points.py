@@ -1,9 +1,13 @@
-"""Equations at several operating points: one support for all, its coefficients, and their law."""
+"""Equations at several operating points: one structure for all, its coefficients, and their law."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from itertools import chain, product
+from math import prod
 
 import numpy as np
 from jaxtyping import Float
@@ -15,41 +19,83 @@ from ep2sindy.discovery.method import Regression, TrajectorySearch
 from ep2sindy.discovery.result import Discovery, DiscoveryMethod, join_points
 from ep2sindy.discovery.shared_support import SharedFront, check_shared, search_shared
 from ep2sindy.library.library import Library
-from ep2sindy.library.relations import Constraint
+from ep2sindy.library.roles import Roles
+from ep2sindy.model.model import SparseModel
 from ep2sindy.operating.law import (
     LawConstraint,
     LawFunctions,
-    OperatingLaw,
     constrain_law,
-    law_of_constraint,
+    constrain_roles,
     read_law,
 )
+from ep2sindy.operating.left_out import LawChoice, LawTrial, choose_law, follow_together, test_trials
 from ep2sindy.operating.point_fits import PointFits, fit_rows, fit_trajectories
-from ep2sindy.operating.records import values_of
+from ep2sindy.operating.records import OperatingRecord, values_of
 from ep2sindy.refinement.problem import RefinementSettings
+from ep2sindy.refinement.windows import PERIODS
 from ep2sindy.regression.ambiguity import ambiguities
-from ep2sindy.regression.pooled import fewest_of_least
+from ep2sindy.regression.formulations import Differential, RandomSplit
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.regression.searches import BestSubset
+from ep2sindy.runtime.parallel import Workers, collect
 from ep2sindy.runtime.progress import Progress, count_pieces
+from ep2sindy.selection.conserving import search_conserving_systems
+from ep2sindy.selection.criteria import EBIC
+from ep2sindy.selection.free_run import FreeRunScore
+from ep2sindy.selection.systems import Systems, Trial, order_together
 
-# States are weighted by their standard deviation at every point: points weigh alike in a law.
-WINDOWS = RefinementSettings(n_windows=20, periods=2.0, n_reweights=0)
+Problems = Mapping[str, Sequence[RegressionRows]]  # by the label of the point
+
+# Windows of the refinements; and if a state was made of another one, and is less certain.
+WINDOWS = RefinementSettings(n_windows=20, periods=2.0)
+LONG_WINDOWS = RefinementSettings(n_windows=10, periods=8.0)
+
+# Most structures that are compared by their laws, and sizes of the supports that they combine: of
+# measured states, and of one that was made of another.
+MOST_COMBINED, SIZES, MADE_SIZES = 27, (2, 3, 4), (4, 5, 6)
+
+N_UNDER_ROLES = 4  # structures under roles whose laws are compared
+
+FOUND, REFINED = "found", "_refined"  # names of structures, and the end of that of a refinement
+
+
+@dataclass(frozen=True)
+class LawSearch:
+    """How one law over operating points is found; `ep.discover(runs, law=...)` takes it.
+
+    Parameters
+    ----------
+    functions : int, Library, "auto" or list of these, default "auto"
+        Of the parameters: see `ep.discover`.
+    windows : RefinementSettings, optional
+        Windows of trajectories on which the coefficients of every point are refined. None takes 20
+        of two periods after a `TrajectorySearch`, or ten of eight if one state was made of another,
+        as by `ep.embed`; after a `Regression` the coefficients stay those of its rows.
+
+    Examples
+    --------
+    >>> windows = ep.refinement.RefinementSettings(n_windows=20, periods=4.0)
+    >>> ep.operating.LawSearch(1, windows).functions
+    1
+    """
+
+    functions: LawFunctions | Sequence[LawFunctions] = "auto"
+    windows: RefinementSettings | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class PointsProblem:
     """What is asked of several operating points together, and the method that answers it.
 
-    points: the runs of each point, by its label. structure: the constraint of terms that a search
-    under roles has found; or None.
+    points: the runs of each point, by its label. law: None asks for one structure alone.
     Raises ValueError for hidden states, or a method that cannot weigh all points at once.
     """
 
     asked: DiscoveryProblem
     points: Mapping[str, Sequence[Trajectory]]
     method: DiscoveryMethod
-    structure: Constraint | None = None
+    law: LawSearch | None
+    workers: Workers
 
     def __post_init__(self) -> None:
         if self.asked.hidden:
@@ -59,9 +105,9 @@ class PointsProblem:
             )
         check_shared(self.regression)
 
-    @property
+    @cached_property
     def regression(self) -> Regression:
-        """The regression by which supports for all points are found."""
+        """The regression by which structures for all points are found."""
         if isinstance(self.method, Regression):
             return self.method
         if not isinstance(self.method, TrajectorySearch):
@@ -69,56 +115,69 @@ class PointsProblem:
                 "equations of several points are found by Regression or TrajectorySearch, got "
                 f"{self.method!r}"
             )
-        n_terms = self.method.max_terms
-        return Regression(search=BestSubset() if n_terms is None else BestSubset(max_terms=n_terms))
+        n_terms = self.method.max_terms or BestSubset().max_terms
+        if self.roles is not None:
+            search, rule = BestSubset(n_terms, n_best=2000), FreeRunScore(window_periods=4.0)
+            return Regression(search=search, selection=rule, depth=16)
+        if self.asked.made:
+            rows = Differential(split=RandomSplit(test_fraction=0.0))
+            return Regression(rows, BestSubset(n_terms, n_best=2), depth=2)
+        return Regression(search=BestSubset(n_terms))
+
+    @property
+    def windows(self) -> RefinementSettings | None:
+        """Windows of the refinements; None leaves the coefficients as the rows gave them."""
+        if self.law is not None and self.law.windows is not None:
+            return self.law.windows
+        if not isinstance(self.method, TrajectorySearch):
+            return None
+        if isinstance(self.regression.selection, FreeRunScore):
+            return replace(WINDOWS, periods=self.regression.selection.window_periods)
+        return LONG_WINDOWS if self.asked.made else WINDOWS
+
+    @property
+    def roles(self) -> Roles | None:
+        return self.asked.facts.roles
 
     @property
     def parameters(self) -> tuple[str, ...]:
         return tuple(self.asked.runs[0].parameters)
 
-    @property
+    @cached_property
     def values(self) -> Float[np.ndarray, "points parameters"]:
         return values_of(self.points)
 
-    def discover(
-        self,
-        law: LawFunctions | Sequence[LawFunctions] | None,
-        *,
-        rng: np.random.Generator,
-        progress: Progress,
-    ) -> Discovery:
-        """One support for all points, its coefficients at each, and their law if one is asked."""
-        problems = self._rows(rng, progress)
-        fronts = search_shared(problems, self.asked, self.regression, progress=progress)
-        rows = fit_rows(
-            self.parameters, self.values, list(problems.values()), self._relations(fronts),
-            provenance=self.regression.provenance,
-        )  # fmt: skip
-        fits, found = rows, None if law is None else choose_law(rows, law)
-        if isinstance(self.method, TrajectorySearch):
-            start, runs = rows, list(self.points.values())
-            if found is not None:  # it averages the noise of the rows of all points
-                at = [dict(zip(self.parameters, p, strict=True)) for p in rows.points.tolist()]
-                start = replace(rows, models=[read_law(found, point) for point in at])
-            fits = fit_trajectories(start, runs, WINDOWS, seed=rng, progress=progress)
-            found = None if law is None else choose_law(fits, law)
+    @property
+    def assessed(self) -> list[str]:
+        """The states that laws are judged by: those that were not made of others."""
+        return [state for state in self.asked.states if state not in self.asked.made]
+
+    def discover(self, *, rng: np.random.Generator, progress: Progress) -> Discovery:
+        """One structure for all points, its coefficients at each, and their law if one is asked."""
+        search = _Search(self, self._rows(rng, progress), rng, progress)
+        if self.law is None:
+            fits, found = search.fit(search.structures[:1])[-1], None
+        else:
+            found = search.choose(self.law.functions)
+            fits = found.choice.fits
         points: dict[str, Discovery] = {}
+        fronts, regression = search.fronts_of(fits.relations), self.regression
         for k, (label, same_point) in enumerate(self.points.items()):
             own = [front.points[label] for front in fronts]
-            alike = [each for part in problems[label] for each in ambiguities(part)]
+            alike = [each for part in search.problems[label] for each in ambiguities(part)]
             points[label] = replace(
-                join_choice(own, [f.best for f in own], fits.models[k], self.regression),
+                join_choice(own, [f.best for f in own], fits.models[k], regression),
                 model=replace(fits.models[k], clock=same_point[0].clock),
                 ambiguities=tuple(dict.fromkeys(alike)),
                 constraint=fits.relations.at(fits.points[[k]])[0],
+                records=same_point,
             )
         return join_points(points, self.values, found)
 
-    def _rows(
-        self, rng: np.random.Generator, progress: Progress
-    ) -> dict[str, Sequence[RegressionRows]]:
+    def _rows(self, rng: np.random.Generator, progress: Progress) -> Problems:
         """Rows of every point, made in the order of their names, so that theirs does not count."""
-        form, library = self.regression.formulation, self.asked.library
+        form = self.regression.formulation
+        library = self.asked.at_point.with_known_terms(self.asked.states)
         labels = count_pieces(progress, sorted(self.points), "point", "rows of the regression")
         rows = {
             label: form.assemble([r.complete() for r in self.points[label]], library, rng=rng)
@@ -126,27 +185,157 @@ class PointsProblem:
         }
         return {label: rows[label] for label in self.points}
 
-    def _relations(self, fronts: Sequence[SharedFront]) -> LawConstraint:
-        """The terms of all points, with their relations."""
-        if self.structure is not None:
-            return law_of_constraint(self.structure, self.parameters)
-        return constrain_law(
-            self.asked.library,
-            {front.equation: front.chosen for front in fronts},
-            parameters=self.parameters,
+
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """The structures of a problem, and the laws of their fits. problems: rows of every point."""
+
+    problem: PointsProblem
+    problems: Problems
+    rng: np.random.Generator
+    progress: Progress
+
+    @cached_property
+    def library(self) -> Library:
+        """The terms of the rows, without what is known."""
+        return next(iter(self.problems.values()))[0].library.plain
+
+    @cached_property
+    def fronts(self) -> list[SharedFront]:
+        """Supports of every equation that all points share."""
+        one = self.problem
+        return search_shared(self.problems, one.asked, one.regression, progress=self.progress)
+
+    def fronts_of(self, structure: LawConstraint) -> list[SharedFront]:
+        """The fronts whose best supports are those of this structure."""
+        one, terms = self.problem, structure.common.support
+        if one.roles is None and all({*f.chosen} == {*terms[f.equation]} for f in self.fronts):
+            return self.fronts
+        known = replace(one.asked, library=self.library.only(terms))
+        rule = replace(one.regression, selection=EBIC())
+        return search_shared(self.problems, known, rule, progress=self.progress)
+
+    @cached_property
+    def structures(self) -> list[LawConstraint]:
+        """The structures to be compared, the likeliest first."""
+        one = self.problem
+        if one.roles is not None:
+            return self._under_roles(one.roles)
+        chosen = {front.equation: front.chosen for front in self.fronts}
+        found = [constrain_law(one.asked.library, chosen, parameters=one.parameters)]
+        if one.law is None or one.windows is None:
+            return found
+        sizes = MADE_SIZES if one.asked.made else SIZES
+        supports = [
+            [front.chosen]
+            if front.equation in one.asked.facts.only
+            else [s for s in front.supports if len(s) in sizes] or [front.chosen]
+            for front in self.fronts
+        ]
+        several = product(*supports) if prod(map(len, supports)) <= MOST_COMBINED else ()
+        for terms in several:
+            support = dict(zip(chosen, terms, strict=True))
+            with suppress(ValueError):  # relations that these terms cannot keep
+                if support != chosen:
+                    own = constrain_law(one.asked.library, support, parameters=one.parameters)
+                    found.append(own)
+        return found
+
+    def _under_roles(self, roles: Roles) -> list[LawConstraint]:
+        """Structures that keep the roles at every point, the best by free runs of each first."""
+        one, regression = self.problem, self.problem.regression
+        rule = regression.selection
+        if not isinstance(rule, FreeRunScore):
+            raise ValueError(
+                "roles tie all equations together, so a rule must rank whole systems: selection "
+                f"must be FreeRunScore(), got {rule!r}"
+            )
+        tasks = [replace(one.asked, runs=runs) for runs in one.points.values()]
+        tasks = [replace(task, library=task.at_point) for task in tasks]
+        asked = list(zip(tasks, self.problems.values(), strict=True))
+        systems = search_conserving_systems(asked, regression.search, depth=regression.depth)
+        pieces = [(own, task.runs) for own, task in zip(systems, tasks, strict=True)]
+        stage = self.progress.stage(len(pieces), "point", "free runs of systems")
+        trials = collect(one.workers, partial(_try_systems, rule=rule), pieces, stage)
+        constrain = partial(
+            constrain_roles, self.library, one.asked.states, roles=roles, parameters=one.parameters
         )
+        best = order_together(trials, rule.margin)[:N_UNDER_ROLES]
+        return [constrain(systems[0].systems[k].constraint.processes) for k in best]
+
+    def fit(self, structures: Sequence[LawConstraint]) -> list[PointFits]:
+        """All structures fitted to rows; and then all of them refined, if that is asked for."""
+        one = self.problem
+        rows = [
+            fit_rows(
+                one.parameters, one.values, list(self.problems.values()), structure,
+                provenance=one.regression.provenance,
+            )
+            for structure in structures
+        ]  # fmt: skip
+        if one.windows is None:
+            return rows
+        refined = fit_trajectories(
+            rows, list(one.points.values()), one.windows, first=list(map(self._first, rows)),
+            seed=self.rng, workers=one.workers, progress=self.progress,
+        )  # fmt: skip
+        return [*rows, *refined]
+
+    def _first(self, rows: PointFits) -> Sequence[SparseModel]:
+        """Models to begin refinements with: of a law, which averages the noise of all rows."""
+        law = None if self.problem.law is None else self.problem.law.functions
+        with suppress(ValueError):
+            if law is not None:
+                of_rows = rows.law(rows.functions(law))
+                at = [dict(zip(rows.parameters, p, strict=True)) for p in rows.points.tolist()]
+                return [read_law(of_rows, point) for point in at]
+        return rows.models
+
+    def choose(self, law: LawFunctions | Sequence[LawFunctions]) -> LawChoice:
+        """The law that does best at points left out; other structures if the likeliest fails.
+
+        Under roles the structures were run freely, and the best few of them are compared.
+        """
+        n = len(self.structures) if self.problem.roles is not None else 1
+        found = self._choose(self.structures[:n], law, [])
+        if not found.is_trusted and len(self.structures) > n:
+            found = self._choose(self.structures[n:], law, found.trials)
+        return found
+
+    def _choose(
+        self,
+        structures: Sequence[LawConstraint],
+        law: LawFunctions | Sequence[LawFunctions],
+        known: Sequence[LawTrial],
+    ) -> LawChoice:
+        """The best of these structures and of what is known already."""
+        one, reason, trials = self.problem, "", list[LawTrial]()
+        longest = partial(max, key=lambda run: run.n_samples)
+        records = [OperatingRecord(longest(runs)) for runs in one.points.values()]
+        n, first = len(structures), len({id(trial.fits.relations) for trial in known}) + 1
+        fits = self.fit(structures)
+        for k, own in enumerate(fits):
+            name = f"{FOUND}_{first + k % n}{REFINED if own.statuses else ''}"
+            try:
+                trial = LawTrial(name, own, own.functions(law), records, one.assessed)
+                trials.append(trial)
+            except ValueError as error:
+                reason = str(error)
+        if not (trials or known):
+            raise ValueError(reason)
+        if one.windows is not None:
+            periods = max(1.0, one.windows.periods or PERIODS)
+            follow = partial(follow_together, law=law, periods=periods)
+            refined = [trial for trial in trials if trial.fits.statuses]
+            stage = self.progress.stage(len(refined), "structure", "laws over all points")
+            trials = [trial for trial in trials if not trial.fits.statuses]
+            trials += chain(*collect(one.workers, follow, refined, stage))
+        tested = test_trials(trials, workers=one.workers, progress=self.progress)
+        return choose_law([*known, *tested])
 
 
-def choose_law(fits: PointFits, law: LawFunctions | Sequence[LawFunctions]) -> OperatingLaw:
-    """The law through the fits of all points, of several the one that errs least where left out.
-
-    Laws whose errors cannot be distinguished count as equal, and that of fewest functions is taken.
-    Raises ValueError if the points do not suffice for any.
-    """
-    if isinstance(law, int | str | Library):
-        return fits.law(fits.functions(law))
-    tested, reasons = fits.test_laws(law)
-    if not tested:
-        raise ValueError(["law=[...] must name degrees or functions", *reasons][-1])
-    best = fewest_of_least([(errors, len(functions)) for functions, errors in tested])
-    return fits.law(tested[best][0])
+def _try_systems(
+    piece: tuple[Systems, Sequence[Trajectory]], *, rule: FreeRunScore
+) -> list[Trial]:
+    systems, runs = piece
+    return rule.trials(systems, runs)

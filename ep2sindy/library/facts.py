@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any
 
+from ep2sindy.library.names import factors_of
 from ep2sindy.library.relations import Place, Relation
 from ep2sindy.library.roles import Roles
 from ep2sindy.library.terms import NamedTerms
@@ -84,6 +85,17 @@ class Facts:
         named = [(state, term) for r in self.relations for _, state, term in r.factors]
         named += [(state, term) for state, terms in self.only.items() for term in terms]
         return [*named, *self.known_factors]
+
+    @property
+    def made(self) -> set[str]:
+        """The variables that known equations of others define, as v is by x' = v.
+
+        An equation is known if its terms are given and each has a number as coefficient.
+        """
+        numbers = {r.factors[0][1:] for r in self.relations if len(r.factors) == 1}
+        known = {s: terms for s, terms in self.only.items()
+                 if all((s, term) in numbers for term in terms)}  # fmt: skip
+        return {v for s, terms in known.items() for t in terms for v in factors_of(t) if v != s}
 
     def check(self, library: NamedTerms) -> None:
         """Raise ValueError for an unknown term, one that is excluded and named, or none left."""

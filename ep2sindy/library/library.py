@@ -160,12 +160,21 @@ class Library:
         return mask
 
     def at_operating_point(self, parameters: Mapping[str, float]) -> Library:
-        """This library with relations in place of `known`: the numbers at an operating point."""
+        """This library with numbers in place of what is known by functions of the point."""
+
+        def value_of(coefficient: str, factors: Mapping[str, float]) -> float:
+            functions = functions_of_point(list(parameters), coefficient, factors)
+            values = functions.evaluate(np.array([*parameters.values()]))
+            return float(values @ np.array([*factors.values()]))
+
+        roles = self.facts.roles
+        if roles is not None and roles.by_point:
+            inflow = {state: value_of(f"{state} in", f) for state, f in roles.by_point.items()}
+            own = replace(roles, inflow={**roles.inflow, **inflow})
+            return replace(self, facts=replace(self.facts, roles=own))
         known = []
         for (state, term), factors in self.facts.known_factors.items():
-            functions = functions_of_point(list(parameters), f"{state}: {term}", factors)
-            values = functions.evaluate(np.array([*parameters.values()]))
-            value = float(values @ np.array([*factors.values()]))
+            value = value_of(f"{state}: {term}", factors)
             known.append(Relation(((1.0, state, term),), value, f"{state}: {term} == {value!r}"))
         return replace(self, facts=replace(self.facts, known={})).relate(*known) if known else self
 

@@ -136,6 +136,11 @@ class Constraint:
         assert np.array_equal(self.C[self.free], np.eye(len(self.free)))
         assert not self.d[self.free].any()
 
+    @property
+    def support(self) -> dict[str, list[str]]:
+        """The terms of the equation of each state."""
+        return {s: [t for state, t in self.coefficients if state == s] for s in self.states}
+
     def coef(self, z: Float[np.ndarray, " free"]) -> Float[np.ndarray, " coefs"]:
         """Values of all coefficients from the values z of the free ones."""
         return self.C @ z + self.d

@@ -23,6 +23,7 @@ from ep2sindy.library.terms import NamedTerms, read_term
 from ep2sindy.runtime.values import check_list
 
 KNOWN, FREE, EITHER = "known", "free", "known or free"
+BY_POINT = "by the point"  # of an inflow that is a sum of functions of the operating point
 
 Equations = Mapping[str, Mapping[str, float]]  # state -> term -> number
 Processes = Sequence[Process]
@@ -74,7 +75,8 @@ class Roles:
         States that lose something to the outside.
     inflow : mapping of str to how
         What each state is supplied with: a number in SI per second, "free", "known",
-        "known or free", or a list of terms, such as births by the state itself.
+        "known or free", or a list of terms, such as births by the state itself. Of several
+        operating points also a sum of functions of the point, as {"mdot_mg_s": 4.58e22}.
     nonnegative : bool, default False
         True if states cannot be negative and terms obey mass action.
     sizes : mapping of str to float, default {}
@@ -152,9 +154,17 @@ class Roles:
         ways = leaving if isinstance(leaving, Mapping) else dict.fromkeys(leaving, FREE)
         found += [Role(state, "", how) for state, how in ways.items()]
         for state, how in self.inflow.items():
-            is_number = not isinstance(how, str | bool | Mapping | Sequence)
-            found.append(Role("", state, {"1": float(how)} if is_number else how))
+            if isinstance(how, Mapping):
+                how = BY_POINT
+            elif not isinstance(how, str | bool | Sequence):
+                how = {"1": float(how)}
+            found.append(Role("", state, how))
         return found
+
+    @property
+    def by_point(self) -> dict[str, Mapping[str, float]]:
+        """Inflows that are sums of functions of the operating point: state -> function -> factor."""
+        return {state: how for state, how in self.inflow.items() if isinstance(how, Mapping)}
 
     @property
     def names(self) -> set[str]:
@@ -231,7 +241,8 @@ class Roles:
                 role.taker: role.how["1"] if isinstance(role.how, Mapping) else role.how
                 for role in roles
                 if not role.giver
-            },
+            }
+            | self.by_point,
         )
 
     def in_zones(self, sizes: Mapping[str, float]) -> Roles:
@@ -367,6 +378,11 @@ class Roles:
                 f"{self.open} are known only where a record gives them, as in the experiments on a "
                 f"simulated thruster: give numbers in SI, or {FREE!r}"
             )
+        if self.by_point:
+            raise ValueError(
+                f"an inflow by the operating point needs runs that have one, got {self.by_point}: "
+                "give Trajectory(..., parameters={...}), or a number in SI per second"
+            )
         if self.inflow:
             library.index("1")
         variables = tuple(dict.fromkeys([*library.variables, *states]))
@@ -379,7 +395,7 @@ class Roles:
 
 def _check_how(role: Role) -> None:
     """Raises ValueError for a role that is not played in one of the ways that `Roles` names."""
-    how, words = role.how, (KNOWN, FREE, EITHER)
+    how, words = role.how, (KNOWN, FREE, EITHER, *([] if role.giver else [BY_POINT]))
     if isinstance(how, str):
         is_one = how in words
     elif isinstance(how, Mapping):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -47,6 +47,13 @@ class Restarts:
 
     model: Equations
     record: Trajectory
+
+    def of(self, model: Equations) -> Restarts:
+        """Another model of the same terms along the same record, by the same steps."""
+        other = replace(self, model=model)
+        for name in ("samples", "std", "_n_substeps", "_drive", "_bound"):
+            other.__dict__[name] = getattr(self, name)
+        return other
 
     @cached_property
     def samples(self) -> Float[np.ndarray, "samples n_states"]:

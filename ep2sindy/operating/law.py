@@ -21,7 +21,8 @@ from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import point_label
 from ep2sindy.library.equations import equation_text
 from ep2sindy.library.library import Library, functions_of_point, named_terms
-from ep2sindy.library.relations import Constraint, Relation, constraint
+from ep2sindy.library.relations import Constraint, Process, Relation, constraint
+from ep2sindy.library.roles import IN, Roles, constraint_of
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.storage import covariance_in, names_in, read_as, read_stored, texts_in
 from ep2sindy.operating.records import check_varying, read_points
@@ -349,12 +350,14 @@ class LawConstraint:
 
     common: names of the coefficients, the free ones z, and C; its d is zero. functions: g, of the
     parameters. D: the known part of every coefficient. texts: the relations, one text for each.
+    inflow: state -> function -> factor, of roles that are known by the point.
     """
 
     common: Constraint
     functions: Library
     D: Float[np.ndarray, "coefs functions"]
     texts: tuple[str, ...]
+    inflow: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "D", read_only(self.D))
@@ -374,7 +377,17 @@ class LawConstraint:
                     "known coefficients must be finite and not zero at every operating point, got "
                     f"{values.tolist()} at {where}; leave the term or the point out"
                 )
-        return [replace(self.common, d=values) for values in d]
+        names, g = self.functions.names, self.functions.evaluate(points)
+        inflow = {s: g[:, list(map(names.index, f))] @ [*f.values()] for s, f in self.inflow.items()}
+        return [
+            replace(
+                self.common,
+                d=values,
+                known=tuple(_supplied(p, {s: x[k] for s, x in inflow.items()})
+                            for p in self.common.known),
+            )
+            for k, values in enumerate(d)
+        ]  # fmt: skip
 
     def make_law(
         self,
@@ -448,14 +461,48 @@ def constrain_law(
     return LawConstraint(common, functions, np.column_stack([c.d for c in columns]), tuple(texts))
 
 
-def law_of_constraint(relations: Constraint, parameters: Sequence[str]) -> LawConstraint:
-    """The same relations, and the same known coefficients, at every operating point."""
-    return LawConstraint(
-        common=replace(relations, d=np.zeros(len(relations.d))),
-        functions=named_terms(list(parameters), ["1"]),
-        D=relations.d[:, None],
-        texts=(),
-    )
+def constrain_roles(
+    library: Library,
+    states: Sequence[str],
+    processes: Sequence[Process],
+    roles: Roles,
+    *,
+    parameters: Sequence[str],
+) -> LawConstraint:
+    """What the processes of one structure ask of the coefficients at every operating point.
+
+    roles: with the inflows that are known, as numbers or by functions of the point.
+    Raises ValueError for functions that are not of the parameters, or if the coefficients do not
+    tell the processes apart.
+    """
+    functions = named_terms(list(parameters), ["1"])
+    for state, factors in roles.by_point.items():
+        functions = functions + functions_of_point(parameters, f"{state} in", factors)
+
+    def held(inflow: Mapping[str, float]) -> Constraint:
+        own = replace(roles, inflow={**roles.inflow, **dict.fromkeys(roles.by_point, 0.0), **inflow})
+        found = constraint_of(library, states, processes, own.known_processes)
+        if found is None:
+            raise ValueError(f"the coefficients do not tell these roles apart: {roles}")
+        return found
+
+    # What is known enters every coefficient linearly: one function of the point at a time.
+    base = held({})
+    D = np.zeros((len(base.coefficients), len(functions)))
+    D[:, 0] = base.d
+    texts = []
+    for state, factors in roles.by_point.items():
+        for name, factor in factors.items():
+            D[:, functions.index(name)] += held({state: factor}).d - base.d
+        texts.append(_text(state, "1", factors))
+    common = replace(base, d=np.zeros(len(base.d)))
+    return LawConstraint(common, functions, D, tuple(texts), roles.by_point)
+
+
+def _supplied(process: Process, inflow: Mapping[str, float]) -> Process:
+    """A known process with what is supplied at a point, if it is one of these inflows."""
+    state = process.role.removesuffix(IN)
+    return replace(process, value=inflow[state]) if state in inflow else process
 
 
 def _text(state: str, term: str, factors: Mapping[str, float]) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import chain, product
 
 import numpy as np
@@ -20,16 +20,31 @@ from ep2sindy.model.model import SparseModel
 from ep2sindy.operating.law import LawConstraint, LawFunctions, OperatingLaw, make_basis
 from ep2sindy.refinement.assess import RefinementStatus
 from ep2sindy.refinement.problem import RefinementSettings
-from ep2sindy.refinement.refine import Refinement, refine
-from ep2sindy.regression.constrained import read_coefficients, solve_constrained
-from ep2sindy.regression.pooled import invert_covariance, pool_rows, residuals_left_out, root_of
+from ep2sindy.refinement.refine import refine
+from ep2sindy.regression.constrained import (
+    ConstrainedSolution,
+    read_coefficients,
+    solve_constrained,
+)
+from ep2sindy.regression.pooled import (
+    fewest_of_least,
+    invert_covariance,
+    pool_rows,
+    residuals_left_out,
+    root_of,
+)
 from ep2sindy.regression.rows import RegressionRows
+from ep2sindy.runtime.parallel import SURROUNDING, Workers, collect
 from ep2sindy.runtime.progress import SILENT, Progress
+from ep2sindy.signals.spectrum import dominant_frequency
 
 Problems = Sequence[Sequence[RegressionRows]]  # for each point, the rows of every equation
 
 # Of refinements whose coefficients tell nothing.
 FAILED = (RefinementStatus.NON_FINITE, RefinementStatus.FLAT, RefinementStatus.MAX_ITER)
+
+# Rows depend on each other over a cycle, which repeats itself: blocks of intervals hold two.
+BLOCK_PERIODS = 2.0
 
 MANY = 3  # parameters up to which all combinations of their functions are tried
 
@@ -49,7 +64,10 @@ class PointFits:
     the noise of their records.
     Assumes that one law holds at all points.
     points: (points, parameters). relations: that hold at every point. models: one per point.
-    information: of the free coefficients, in SI. how: "rows" or "trajectories".
+    information: of the free coefficients, in SI; zero of a fit that failed. how: "rows" or
+    "trajectories". statuses, losses: of the refinement at each point; empty for rows. rows: R_p and
+    y_p of |R_p W f(p) - y_p|^2, if the law was fitted to all points at once (`follow_windows`);
+    None takes those of the sum above.
     """
 
     parameters: tuple[str, ...]
@@ -58,6 +76,18 @@ class PointFits:
     models: Sequence[SparseModel]
     information: Float[np.ndarray, "points free free"]
     how: str
+    statuses: Sequence[str] = ()
+    losses: Sequence[float] = ()
+    rows: Sequence[tuple[Float[np.ndarray, "free free"], Float[np.ndarray, " free"]]] | None = None
+
+    def at(self, numbers: Sequence[int]) -> PointFits:
+        """The fits of some of the points."""
+        kept = list(numbers)
+        statuses, losses = ([v[k] for k in kept] if v else () for v in (self.statuses, self.losses))
+        return replace(
+            self, points=self.points[kept], models=[self.models[k] for k in kept],
+            information=self.information[kept], statuses=statuses, losses=losses,
+        )  # fmt: skip
 
     @property
     def n_free(self) -> int:
@@ -70,31 +100,40 @@ class PointFits:
         common = self.relations.common
         return np.array([read_coefficients(model, common) for model in self.models])[:, common.free]
 
-    def functions(self, law: LawFunctions) -> Library:
-        """Functions of the parameters that a law is made of; "auto" takes `choose_functions`."""
-        if law == "auto":
-            return self.choose_functions()
-        if isinstance(law, int):
-            return polynomial(list(self.parameters), degree=law)
-        assert isinstance(law, Library)
-        return law
+    def candidates(self, law: LawFunctions | Sequence[LawFunctions]) -> list[Library]:
+        """Functions of the parameters that a law may be made of, the likeliest first.
 
-    def choose_functions(self) -> Library:
-        """The functions whose law errs least at points left out, of those that records often need.
-
-        Of every parameter p these are p and, or not, p^2 and 1/p, or all products up to degree 2.
-        The errors are `rate_errors`, in the root mean square over the points.
-        Raises ValueError if the points do not suffice for a law that is linear in all parameters.
+        "auto" takes those that records often need: of every parameter p it is p and, or not, p^2
+        and 1/p, or all products up to degree 2. Of several laws that of fewest functions comes
+        first, of those whose `rate_errors` cannot be told from the least; then the best of every
+        larger size.
+        Raises ValueError if the points do not suffice for any of several.
         """
+        if isinstance(law, int):
+            return [polynomial(list(self.parameters), degree=law)]
+        if isinstance(law, Library):
+            return [law]
+        several = self._usual_functions() if isinstance(law, str) else law
+        tested, reasons = self.test_laws(several)
+        if not tested:
+            raise ValueError([*reasons, "law=[...] must name degrees or functions"][0])
+        place = fewest_of_least([(errors, len(own)) for own, errors in tested])
+        found = [tested.pop(place)[0]]
+        for own, _ in sorted(tested, key=lambda one: (len(one[0]), float(one[1].mean()))):
+            if len(own) > len(found[-1]):
+                found.append(own)
+        return found
+
+    def functions(self, law: LawFunctions | Sequence[LawFunctions]) -> Library:
+        """The likeliest functions of a law; see `candidates`."""
+        return self.candidates(law)[0]
+
+    def _usual_functions(self) -> list[Library]:
         names = list(self.parameters)
         own = [[(), (f"{p}^2",), (f"1/{p}",), (f"{p}^2", f"1/{p}")] for p in names]
         sets = [[*chain(*more)] for more in product(*own)] if len(names) <= MANY else [[]]
-        candidates = [named_terms(names, ["1", *names, *more]) for more in sets]
-        candidates.append(polynomial(names, degree=2))
-        tested, reasons = self.test_laws(candidates)
-        if not tested:
-            raise ValueError(reasons[0])
-        return min(tested, key=lambda law: np.square(law[1]).mean())[0]
+        usual = [named_terms(names, ["1", *names, *more]) for more in sets]
+        return [*usual, polynomial(names, degree=2)]
 
     def test_laws(
         self, laws: Sequence[LawFunctions]
@@ -123,10 +162,10 @@ class PointFits:
         if the points do not suffice for a law without each of them.
         Source: Efron & Stein 1981, doi:10.1214/aos/1176345462, for the jackknife.
         """
-        free, covariance, errors = self._pool(functions), None, None
+        free, covariance, errors = self.pool(functions), None, None
         with suppress(ValueError):  # too few points to leave one out
             errors = self.rate_errors(functions)
-            laws = np.stack([self._pool(functions, without=k) for k in range(len(self.models))])
+            laws = np.stack([self.pool(functions, without=k) for k in range(len(self.models))])
             apart = (laws - laws.mean(axis=0)).reshape(len(laws), -1)
             covariance = (len(laws) - 1) / len(laws) * apart.T @ apart
         columns = self.columns(functions)
@@ -137,7 +176,7 @@ class PointFits:
     def law_without(self, number: int, functions: Library) -> OperatingLaw:
         """The law of all points but one, without covariance."""
         columns = np.delete(self.columns(functions), number, axis=0)
-        free = self._pool(functions, without=number)
+        free = self.pool(functions, without=number)
         return self.relations.make_law(
             self.models[0], functions, columns, free, None, self.how, None
         )
@@ -152,27 +191,30 @@ class PointFits:
         Raises ValueError if the points do not suffice for a law without each of them.
         """
         basis = make_basis(functions, self.columns(functions), n_spare=1)
-        missed = residuals_left_out(self._rows, basis, self._size)
+        missed = residuals_left_out(self._rows, basis, self.size)
         pairs = zip(missed, self._rows, strict=True)
         return np.array([norm(off) / norm(y) if y.any() else 1.0 for off, (_, y) in pairs])
 
-    def _pool(
+    def pool(
         self, functions: Library, *, without: int | None = None
     ) -> Float[np.ndarray, "free functions"]:
+        """The law W of the free coefficients, of all points or without one."""
         kept = [k for k in range(len(self.models)) if k != without]
         basis = make_basis(functions, self.columns(functions)[kept])
-        return pool_rows([self._rows[k] for k in kept], basis, self._size)
+        return pool_rows([self._rows[k] for k in kept], basis, self.size)
 
     @cached_property
-    def _size(self) -> Float[np.ndarray, " free"]:
+    def size(self) -> Float[np.ndarray, " free"]:
         """Root mean square of every coefficient over the points."""
         return zero_to_one(np.sqrt(np.square(self.coefficients).mean(axis=0)))
 
     @cached_property
     def _rows(self) -> list[tuple[Float[np.ndarray, "free free"], Float[np.ndarray, " free"]]]:
-        """For each point, rows R and R z with R^T R its scaled information."""
-        scale = np.outer(self._size, self._size)
-        roots = [root_of(own * scale) / self._size for own in self.information]
+        """For each point, rows R and R z with R^T R its scaled information; or those given."""
+        if self.rows is not None:
+            return list(self.rows)
+        scale = np.outer(self.size, self.size)
+        roots = [root_of(own * scale) / self.size for own in self.information]
         return [(root, root @ own) for root, own in zip(roots, self.coefficients, strict=True)]
 
 
@@ -187,39 +229,120 @@ def fit_rows(
     """Fit the coefficients to the rows of each point.
 
     Terms that a point's rows do not tell apart are as small there as the rows allow, and the other
-    points decide.
+    points decide. Rows that know the noise of their samples are independent. Of others, the
+    covariance is a sandwich with blocks of two periods as clusters, and none where the records of a
+    point hold too few of these.
     """
     models, information = [], []
     for parts, constraint in zip(problems, relations.at(points), strict=True):
         solution = solve_constrained(parts, constraint)
-        library, units = parts[0].library, parts[0].trajectories[0].units
-        models.append(solution.model(library, units=units, provenance=provenance))
+        library, runs = parts[0].library, parts[0].trajectories
+        root = None if all(each.noisy is not None for each in parts) else _blocks(solution, runs)
+        model = solution.model(library, units=runs[0].units, provenance=provenance, root=root)
+        if root is not None and not root.size:
+            model = replace(model, covariance=None)
+        models.append(model)
         information.append(solution.information)
     return PointFits(tuple(parameters), points, relations, models, np.array(information), "rows")
 
 
+def _blocks(
+    solution: ConstrainedSolution, runs: Sequence[Trajectory]
+) -> Float[np.ndarray, "coefs clusters"]:
+    """Root of the covariance by blocks of two periods; without columns if there are too few."""
+    n_groups = len(np.unique(solution.groups))
+    duration_s = sum(float(run.t[-1] - run.t[0]) for run in runs)
+    frequency_Hz = float(np.median([dominant_frequency(run.t, run.states[:, 0]) for run in runs]))
+    n_periods = frequency_Hz * duration_s
+    try:
+        return solution.clustered_root(max(1, round(BLOCK_PERIODS * n_groups / n_periods)))
+    except (ValueError, ZeroDivisionError):  # an interval that cannot be had ends no fit
+        return np.zeros((len(solution.constraint.coefficients), 0))
+
+
 def fit_trajectories(
-    start: PointFits,
+    starts: Sequence[PointFits],
     runs: Sequence[Sequence[Trajectory]],
     settings: RefinementSettings,
     *,
+    first: Sequence[Sequence[SparseModel]] | None = None,
     seed: int | np.random.Generator = 0,
+    workers: Workers = SURROUNDING,
     progress: Progress = SILENT,
-) -> PointFits:
-    """Refine the coefficients of each point until integrated windows follow its runs."""
-    constraints = start.relations.at(start.points)
-    fits = refine(
-        start.models, runs, settings, constraints=constraints, seed=seed, progress=progress
-    )
-    return replace(
-        start,
-        models=[fit.model for fit in fits],
-        information=np.array([information_of(fit, start.relations.common) for fit in fits]),
-        how="trajectories",
-    )
+) -> list[PointFits]:
+    """Refine the coefficients of each point until integrated windows follow its runs.
+
+    Windows are as long as the periods of their point ask. starts: the fits of several structures.
+    first: models of every structure and point to begin with instead; where that fails, the
+    refinement begins with the point's own. The result of a point does not depend on the others.
+    """
+    held = [start.relations.at(start.points) for start in starts]
+    streams = np.random.default_rng(seed).spawn(len(runs))
+    pieces = [
+        (
+            list(own),
+            [
+                (start.models[k] if first is None else first[n][k], start.models[k], held[n][k])
+                for n, start in enumerate(starts)
+            ],
+            streams[k],
+        )
+        for k, own in enumerate(runs)
+    ]
+    stage = progress.stage(len(pieces), "point", "refinement")
+    found = collect(workers, partial(_refine_point, settings=settings), pieces, stage)
+    return [
+        replace(
+            start,
+            models=[at[n].model for at in found],
+            information=np.array([information_of(at[n], start.relations.common) for at in found]),
+            how="trajectories",
+            statuses=[str(at[n].status) for at in found],
+            losses=[at[n].loss for at in found],
+        )
+        for n, start in enumerate(starts)
+    ]
 
 
-def information_of(fit: Refinement, common: Constraint) -> Float[np.ndarray, "free free"]:
+Start = tuple[SparseModel, SparseModel, Constraint]  # the model to begin with, and the one of rows
+
+
+def _refine_point(
+    piece: tuple[Sequence[Trajectory], Sequence[Start], np.random.Generator],
+    *,
+    settings: RefinementSettings,
+) -> list[_Refined]:
+    """Every structure refined on the runs of one point."""
+    runs, starts, rng = piece
+
+    def refined(models: Sequence[SparseModel], held: Sequence[Constraint]) -> list[_Refined]:
+        found = refine(models, [runs] * len(models), settings, constraints=held, seed=rng)
+        return [_Refined(f.model, f.status, f.loss, f.covariance_naive) for f in found]
+
+    found = refined([first for first, _, _ in starts], [held for *_, held in starts])
+    again = [
+        k
+        for k, (first, own, _) in enumerate(starts)
+        if found[k].status in FAILED and first is not own
+    ]
+    if again:
+        second = refined([starts[k][1] for k in again], [starts[k][2] for k in again])
+        for k, other in zip(again, second, strict=True):
+            found[k] = other
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class _Refined:
+    """What is kept of a refinement: without the windows that it followed."""
+
+    model: SparseModel
+    status: RefinementStatus
+    loss: float
+    covariance_naive: Float[np.ndarray, "_ _"] | None
+
+
+def information_of(fit: _Refined, common: Constraint) -> Float[np.ndarray, "free free"]:
     """Inverse covariance of the free coefficients; zero if the refinement did not converge."""
     free = common.free
     if fit.covariance_naive is None or fit.status in FAILED:

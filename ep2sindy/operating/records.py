@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -90,7 +90,10 @@ class OperatingRecord:
 
     @property
     def from_slowest(self) -> Trajectory:
-        return self.run.window(self.slowest, self.run.n_samples)
+        """The record from its slowest sample on; all of it, if it repeats no cycle."""
+        with suppress(ValueError):
+            return self.run.window(self.slowest, self.run.n_samples)
+        return self.run
 
 
 @contextmanager

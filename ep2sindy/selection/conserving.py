@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from ep2sindy.data.coerce import DiscoveryProblem
 from ep2sindy.data.numbers import column_norms
@@ -14,23 +14,19 @@ from ep2sindy.library.relations import Place, Process
 from ep2sindy.library.roles import Roles, constraint_of, process_matrix
 from ep2sindy.regression.constrained import MIN_RESIDUAL
 from ep2sindy.regression.front import ParetoFront, fit_supports
-from ep2sindy.regression.gram_kernels import fit_masks
+from ep2sindy.regression.gram_kernels import ROUNDING, fit_masks
 from ep2sindy.regression.least_squares import LeastSquares
 from ep2sindy.regression.rows import RegressionRows
-from ep2sindy.regression.searches import Search
+from ep2sindy.regression.searches import BestSubset, Search
 from ep2sindy.selection.systems import Systems, TrialSystem, find_broken_demands
 
-Support = tuple[np.ndarray, np.ndarray]  # indices of processes, and their coefficients
+Asked = tuple[DiscoveryProblem, Sequence[RegressionRows]]  # the runs of a point, and their rows
+Support = Int[np.ndarray, " _"]  # indices of processes
 
 
 def search_conserving_systems(
-    problems: Sequence[RegressionRows],
-    task: DiscoveryProblem,
-    roles: Roles,
-    search: Search,
-    *,
-    depth: int,
-) -> Systems:
+    points: Sequence[Asked], search: Search, *, depth: int
+) -> list[Systems]:
     """The systems that a search proposes for all equations at once, smallest first.
 
         minimise sum over equations e of |y_e - X_e (A_e z + d_e)|^2 / s_e^2 over supports of z
@@ -38,52 +34,114 @@ def search_conserving_systems(
     z holds one amount per process, and column p of A_e its factor in every term of equation e,
     d_e what is known. So a search proposes processes, and what they move is conserved exactly. s_e
     is the standard deviation of what the whole library leaves of y_e; assumes residuals that are
-    independent between rows and equations. Of every size, the `depth` best systems are kept in
-    which every role is played by a process, and those that must be positive are: least squares with
-    these bounds would put another to zero, which is a smaller system. problems: rows of the task's
-    library with the terms of known equations, `with_known_terms`. Raises ValueError for roles that
-    do not fit the task, or if no system plays them all. Called by `ep.discover(run,
-    library.with_roles(roles), method)` for a method such as
+    independent between rows and equations. Of several operating points the product of these sums
+    is minimised, with one support for all and amounts for each. Of every size, the `depth` best
+    systems are kept in which every role is played by a process, and those that must be positive
+    are, at every point: least squares with these bounds would put another to zero, which is a
+    smaller system. points: with the roles of each as its facts, and rows of the task's library with
+    the terms of known equations, `with_known_terms`. Returns the systems of each point, in one
+    order. Raises ValueError for roles that do not fit the task, or if no system plays them all.
+    Called by `ep.discover(run, library.with_roles(roles), method)` for a method such as
     ep.Regression(selection=ep.FreeRunScore()); docs/roles.md shows what comes of it.
     """
-    processes = roles.processes(task.library, task.states)
-    task = replace(task, library=task.library.with_known_terms(task.states))
-    columns, target = _join_rows(problems, task, processes, roles.known)
-    norms = column_norms(columns)
-    unit = columns / norms
-    xx, xy = unit.T @ unit, unit.T @ target
-    masks = search.supports(xx, xy, float(target @ target))
-    complete = _keep_complete(masks, processes, roles.names)
-    coef = fit_masks(xx, xy, complete)
+    joined = [_JoinedRows.of(*point) for point in points]
+    processes = joined[0].processes
+    masks = _propose(joined, search)
+    complete = _keep_complete(masks, processes, joined[0].roles.names)
+    coef = np.array([fit_masks(rows.xx, rows.xy, complete) for rows in joined])
+    left = [1.0 - each @ rows.xy / rows.yy for each, rows in zip(coef, joined, strict=True)]
+    errors = np.log(np.maximum(left, ROUNDING)).mean(axis=0)
     # The smallest come first, of a size by their residual.
-    order = np.lexsort([*~complete.T[::-1], -coef @ xy, complete.sum(axis=1)])
-    independent = order[np.isfinite(coef[order]).all(axis=1)]
-    whole = [(np.flatnonzero(complete[k]), coef[k, complete[k]]) for k in independent]
-    terms = [task.library.index(process.term) for process in processes]
-    means = task.theta.mean(axis=0)[terms] if roles.forward else None
-
-    def parts_of(support: Support) -> tuple[list[Process], np.ndarray, np.ndarray | None]:
-        """Processes of a support, their coefficients, and the means of their terms."""
-        chosen, values = support
-        own_means = None if means is None else means[chosen]
-        return [processes[k] for k in chosen], values / norms[chosen], own_means
-
-    admissible = [support for support in whole if not find_broken_demands(*parts_of(support))]
-    kept = _keep_first(admissible or whole, depth)
-    found = []
-    for chosen, values, own_means in map(parts_of, kept):
-        held = constraint_of(task.library, task.states, chosen, roles.known_processes)
-        if held is not None:  # its coefficients tell the processes apart
-            fixed = np.array([roles.known.get(held.coefficients[k], 0.0) for k in held.free])
-            free = process_matrix(held) @ values + fixed
-            found.append(TrialSystem.of(task, held, free, own_means))
-    if not found:
+    order = np.lexsort([*~complete.T[::-1], errors, complete.sum(axis=1)])
+    independent = order[np.isfinite(coef[:, order]).all(axis=(0, 2))]
+    admissible = [
+        k
+        for k in independent
+        if not any(
+            rows.broken(np.flatnonzero(complete[k]), own[k, complete[k]])
+            for rows, own in zip(joined, coef, strict=True)
+        )
+    ]
+    kept = _keep_first(admissible or independent.tolist(), complete.sum(axis=1), depth)
+    found = [
+        [rows.system(np.flatnonzero(complete[k]), own[k, complete[k]]) for k in kept]
+        for rows, own in zip(joined, coef, strict=True)
+    ]
+    # Those whose coefficients tell the processes apart.
+    told = [[system for system in each if system is not None] for each in found]
+    if not told[0]:
         raise ValueError(
             f"no system of up to {masks.sum(axis=1).max(initial=0)} terms plays all of the roles "
             f"{list(dict.fromkeys(process.role for process in processes))}: raise the search's "
             "max_terms or n_best, or give fewer roles"
         )
-    return _add_fronts(found, problems, task)
+    pairs = zip(told, joined, strict=True)
+    return [_add_fronts(own, rows.problems, rows.task) for own, rows in pairs]
+
+
+@dataclass(frozen=True, eq=False)
+class _JoinedRows:
+    """Rows of all equations of a point, with one column per process; what is known is subtracted.
+
+    norms: of the columns, which are of unit norm in xx and xy. means: of the term of every process
+    over the records, if roles must go forward in the mean.
+    """
+
+    task: DiscoveryProblem
+    problems: Sequence[RegressionRows]
+    roles: Roles
+    processes: Sequence[Process]
+    norms: Float[np.ndarray, " processes"]
+    xx: Float[np.ndarray, "processes processes"]
+    xy: Float[np.ndarray, " processes"]
+    yy: float
+    means: Float[np.ndarray, " processes"] | None
+
+    @staticmethod
+    def of(task: DiscoveryProblem, problems: Sequence[RegressionRows]) -> _JoinedRows:
+        roles = task.facts.roles
+        assert roles is not None
+        processes = roles.processes(task.library, task.states)
+        task = replace(task, library=task.library.with_known_terms(task.states))
+        columns, target = _join_rows(problems, task, processes, roles.known)
+        norms = column_norms(columns)
+        unit = columns / norms
+        terms = [task.library.index(process.term) for process in processes]
+        means = task.theta.mean(axis=0)[terms] if roles.forward else None
+        products = unit.T @ unit, unit.T @ target, float(target @ target)
+        return _JoinedRows(task, problems, roles, processes, norms, *products, means)
+
+    def broken(self, chosen: Support, values: Float[np.ndarray, " _"]) -> list[str]:
+        """The demands that these processes do not meet. values: by columns of unit norm."""
+        means = None if self.means is None else self.means[chosen]
+        own = [self.processes[k] for k in chosen]
+        return find_broken_demands(own, values / self.norms[chosen], means)
+
+    def system(self, chosen: Support, values: Float[np.ndarray, " _"]) -> TrialSystem | None:
+        """The system of these processes; None if its coefficients do not tell them apart."""
+        library, roles = self.task.library, self.roles
+        own = [self.processes[k] for k in chosen]
+        held = constraint_of(library, self.task.states, own, roles.known_processes)
+        if held is None:
+            return None
+        fixed = np.array([roles.known.get(held.coefficients[k], 0.0) for k in held.free])
+        free = process_matrix(held) @ (values / self.norms[chosen]) + fixed
+        return TrialSystem.of(
+            self.task, held, free, None if self.means is None else self.means[chosen]
+        )
+
+
+def _propose(joined: Sequence[_JoinedRows], search: Search) -> Bool[np.ndarray, "_ processes"]:
+    """Supports by the search, which one for several points must weigh together."""
+    if len(joined) == 1:
+        (one,) = joined
+        return search.supports(one.xx, one.xy, one.yy)
+    if not isinstance(search, BestSubset):
+        raise ValueError(
+            f"a search of several points must weigh them at once: {search} cannot; use BestSubset"
+        )
+    xx, xy, yy = (np.array([getattr(rows, key) for rows in joined]) for key in ("xx", "xy", "yy"))
+    return search.shared_supports(xx, xy, yy)
 
 
 def _join_rows(
@@ -126,9 +184,10 @@ def _keep_complete(
     return masks[np.all(played, axis=0)]
 
 
-def _keep_first(supports: Sequence[Support], depth: int) -> list[Support]:
-    sizes = [len(chosen) for chosen, _ in supports]
-    return [each for k, each in enumerate(supports) if k - sizes.index(sizes[k]) < depth]
+def _keep_first(supports: Sequence[int], sizes: Int[np.ndarray, " _"], depth: int) -> list[int]:
+    """The first supports of every size. supports: sorted by size."""
+    own = [int(sizes[k]) for k in supports]
+    return [each for k, each in enumerate(supports) if k - own.index(own[k]) < depth]
 
 
 def _add_fronts(

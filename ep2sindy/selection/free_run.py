@@ -215,6 +215,13 @@ class FreeRunScore:
         others = list_others(sustained, won.trial) if won.run else ()
         return Decision(scores, won.model, note, won.trial.system.constraint, others)
 
+    def trials(
+        self, found: Systems, runs: Sequence[Trajectory], *, progress: Progress = SILENT
+    ) -> list[Trial]:
+        """How every given system does where it was not fitted, in their order."""
+        measure, _ = self._measure(found.fronts, runs)
+        return self._try(found.systems, measure, progress)
+
     def _measure(self, fronts: Fronts, runs: Sequence[Trajectory]) -> tuple[Measure, str]:
         """What systems are assessed by; and why not by their cycles, if these were asked for.
 

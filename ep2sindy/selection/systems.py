@@ -314,6 +314,21 @@ def find_sustained(trials: Sequence[Trial]) -> list[Trial]:
     return [t for t in trials if t.error <= 1.0 and (t.loss < FLOOR or not exact)]
 
 
+def order_together(points: Sequence[Sequence[Trial]], margin: float) -> list[int]:
+    """Indices of systems that were tried at several points, the best first.
+
+    points: the trials of each point, in one order of the systems. First come those that are
+    sustained at most points, then those that have room (error up to `margin`) at most, then the
+    smallest, and of equals those of least error in the geometric mean.
+    """
+    errors = np.array([[trial.error for trial in trials] for trials in points])
+    sizes = [trial.system.n_free for trial in points[0]]
+    mean = np.log(np.maximum(errors, FLOOR)).mean(axis=0)
+    order = np.lexsort([mean, sizes, (errors > margin).sum(axis=0), (errors > 1.0).sum(axis=0)])
+    found: list[int] = order.tolist()
+    return found
+
+
 def list_others(sustained: Sequence[Trial], winner: Trial) -> list[OtherSystem]:
     """The other self-sustained systems of the winner's size, the best waveform first."""
     size = winner.system.n_free
