@@ -7,15 +7,16 @@ it minimises the same sum of squares over the points.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float
+from scipy.optimize import nnls
 
 from ep2sindy.data.numbers import column_norms, zero_to_one
-from ep2sindy.regression.least_squares import LeastSquares
+from ep2sindy.regression.least_squares import CUTOFF, LeastSquares
 from ep2sindy.runtime.values import read_only
 
 # Functions whose columns of unit norm have a singular value below this fraction of the largest
@@ -25,6 +26,10 @@ RANK = 1e-10
 
 # A point with this leverage alone determines some coefficient: without it there is no fit.
 FULL_LEVERAGE = 1.0 - 1e-9
+
+# A violation of a limit weighs STRICT times the residuals of rows whose point weighs one. Number of
+# steps in a fit within limits, halved ones included, and the shortest of these.
+STRICT, N_STEPS, SHORTEST = 1e4, 200, 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,6 +124,72 @@ def pool_rows(
     """
     fit, _ = _fit(rows, basis, size)
     return (basis.to_law(size) @ fit.coef).reshape(-1, basis.values.shape[1])
+
+
+# At a law W, values that must not be positive, and their derivatives by W.ravel().
+Limits = Callable[
+    [Float[np.ndarray, "coefs functions"]],
+    tuple[Float[np.ndarray, " limits"], Float[np.ndarray, "limits numbers"]],
+]
+
+
+def pool_within(
+    rows: Rows, basis: Basis, size: Float[np.ndarray, " coefs"], limits: Limits
+) -> Float[np.ndarray, "coefs functions"]:
+    """Fit one law to the rows of all points as `pool_rows` does, within limits g(W) <= 0.
+
+    A law of `pool_rows` that is within the limits is returned as it is. Otherwise
+
+        minimise  sum_p |theta_p W f(p) - y_p|^2 + STRICT^2 |max(g(W), 0)|^2
+
+    by steps that linearise g, each solved exactly and halved until the objective decreases. The law
+    thus moves where the rows determine it least. Limits that contradict each other or the form of
+    the law are met as far as steps lead: the best law on the way is returned.
+    Source: Lawson & Hanson 1995, Solving Least Squares Problems, ch. 23, for limits by nonnegative
+    least squares.
+    """
+    fit, _ = _fit(rows, basis, size)
+    # The unknowns are fit.coef + root v, where |v|^2 is what a change v adds to the squares.
+    _, strengths, axes = np.linalg.svd(fit.upper * fit.norms)
+    # Directions that they do not determine may be followed, but not far.
+    root = axes.T / np.maximum(strengths, CUTOFF * zero_to_one(strengths[0]))
+    to_law = basis.to_law(size)
+
+    def at(v: np.ndarray) -> tuple[float, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        law = (to_law @ (fit.coef + root @ v)).reshape(-1, basis.values.shape[1])
+        values, slopes = limits(law)
+        beyond = np.maximum(values, 0.0)
+        return float(v @ v + STRICT**2 * beyond @ beyond), v, law, values, slopes @ to_law @ root
+
+    best = now = at(np.zeros(len(fit.coef)))
+    if now[0] == 0.0:
+        return now[2]
+    fraction = 1.0
+    for _ in range(N_STEPS):
+        cost, v, _, values, slopes = now
+        step = _least_within(slopes, slopes @ v - values) - v
+        trial = at(v + fraction * step)
+        if trial[0] >= cost and fraction > SHORTEST:
+            fraction *= 0.5
+            continue
+        # Where no step is downhill, as where two modes of growth meet, a whole one leads on.
+        now, fraction = trial if trial[0] < cost else at(v + step), 1.0
+        best = min(best, now, key=lambda each: each[0])
+        if (1.0 - 1e-9) * cost < now[0] <= cost:
+            break
+    return best[2]
+
+
+def _least_within(
+    slopes: Float[np.ndarray, "limits unknowns"], ends: Float[np.ndarray, " limits"]
+) -> Float[np.ndarray, " unknowns"]:
+    """The v that minimises |v|^2 + STRICT^2 |max(slopes v - ends, 0)|^2, by its multipliers."""
+    # The multipliers m >= 0 minimise |slopes^T m|^2 + |m|^2 / STRICT^2 + 2 ends^T m.
+    stacked = np.concatenate([slopes.T, np.eye(len(slopes)) / STRICT])
+    triangle = np.asarray(np.linalg.qr(stacked, mode="r"))
+    multipliers = nnls(triangle, -np.linalg.solve(triangle.T, ends))[0]
+    v: np.ndarray = -slopes.T @ multipliers
+    return v
 
 
 def residuals_left_out(
