@@ -183,13 +183,10 @@ class OperatingLaw:
         (values,) = read_points([parameters], self.parameters)
         label, inside = point_label(parameters), in_hull(self.points, values)
         if not extrapolate and not inside:
-            ends = self.points.min(axis=0), self.points.max(axis=0)
-            ranges = zip(self.parameters, *ends, strict=True)
-            raise ValueError(
-                f"{label} lies outside the points that this law was fitted to, "
-                f"{', '.join(f'{name} {low:g} to {high:g}' for name, low, high in ranges)}: pass "
-                "extrapolate=True to read it off the law all the same"
-            )
+            raise outside(
+                label, self.parameters, self.points, "law",
+                "pass extrapolate=True to read it off the law all the same",
+            )  # fmt: skip
         functions = self.functions.evaluate(values[None])[0]
         at_point = self.coef @ functions
         coef, used = place_coefficients(self.library, self.states, self.coefficients, at_point)
@@ -314,6 +311,21 @@ def in_hull(
     columns = np.vstack([((points - value) / scale).T, np.ones(len(points))])
     target = np.append(np.zeros(points.shape[1]), 1.0)
     return float(nnls(columns, target)[1]) <= INSIDE
+
+
+def outside(
+    label: str,
+    parameters: Sequence[str],
+    points: Float[np.ndarray, "points parameters"],
+    what: str,
+    remedy: str,
+) -> ValueError:
+    """The error of a point that lies outside the points to which something was fitted."""
+    ranges = zip(parameters, points.min(axis=0), points.max(axis=0), strict=True)
+    return ValueError(
+        f"{label} lies outside the points that this {what} was fitted to, "
+        f"{', '.join(f'{name} {low:g} to {high:g}' for name, low, high in ranges)}: {remedy}"
+    )
 
 
 def make_basis(
