@@ -173,6 +173,29 @@ def test_intervals_follow_the_covariance() -> None:
         replace(law(), covariance=None).intervals()
 
 
+def test_a_law_of_more_terms_than_the_records_determine_says_so() -> None:
+    """On a cycle, x^2*y and x*y^2 make up for what they change in each other and in x."""
+    line = [replace(recorded(a, 0.0).run, parameters={"a": a}) for a in LINE]
+    noisy = [
+        replace(run, states=run.states + 0.03 * np.random.default_rng(k).normal(size=(600, 2)))
+        for k, run in enumerate(line)
+    ]
+    more = {"x": [*STRUCTURE["x"], "x^2*y", "x*y^2"], "y": ["x"]}
+    right, wide = (
+        ep.discover(noisy, LIBRARY.only(terms), ep.Regression(formulation=ep.Weak()), law=1).law
+        for terms in (STRUCTURE, more)
+    )
+    assert right.undetermined == []
+    assert "numbers of" not in right.text()
+    assert wide.undetermined == [("x", "x^2*y"), ("x", "x*y^2")]
+    assert wide.text().endswith(
+        "12 numbers of 5 points: of 6 coefficients, 2 are not told from zero, x: x^2*y, x: x*y^2; "
+        "leave terms out, or add points"
+    )
+    few = by_rows(line[:2]).law(ep.polynomial(["a"], degree=1))
+    assert "8 numbers of 2 points: none is left over" in few.text()
+
+
 def test_intervals_by_the_jackknife_hold_the_truth() -> None:
     """Noise that differs tenfold between the points, and coefficients that leave the law a bit."""
     p, held = np.linspace(1.0, 3.0, 12), []
