@@ -237,3 +237,12 @@ def test_quiet_records_are_told_from_small_cycles(kind: str, is_quiet: bool) -> 
     # With hysteresis a point has both.
     both = quiet_points([[run("loud", 1.0), run("white", 1.0)]], STATES)
     assert [point.parameters["P"] for point in both] == [1.0]
+
+
+def test_a_law_with_inputs_cannot_be_asked_to_rest() -> None:
+    found = replace(fits(tube), quiet=silent(tube))
+    library = ep.polynomial([*STATES, "u"], degree=3)
+    coef = np.zeros((len(library), 2))
+    driven = ep.SparseModel(library, STATES, coef)
+    with pytest.raises(ValueError, match=r"terms of its states alone, got \['u'\] as well"):
+        replace(found, models=[driven, *found.models[1:]]).law_without(0, LINE)

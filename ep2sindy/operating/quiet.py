@@ -119,10 +119,16 @@ def pool_quiet(
     be stable: perturbations decay e-fold within 1 / NEUTRAL periods, where the Jacobian is that of
     the law's own rest point, found by Newton's method, or at the record's if the law has none
     within a scale of it. A law that does so already is that of `pool_rows`, to the last digit.
-    Assumes a model without inputs. functions: of the law, those of the basis.
+    functions: of the law, those of the basis. quiet: with states in the order of the relations'.
+    Raises ValueError for terms of inputs: what rests depends on theirs.
     """
     if not quiet:
         return pool_rows(rows, basis, size)
+    if inputs := [v for v in library.variables if v not in relations.common.states]:
+        raise ValueError(
+            f"a law that rests at quiet points must have terms of its states alone, got {inputs} "
+            "as well; fit it without quiet points"
+        )
     models = [RestingModel.of(point, functions, relations, library) for point in quiet]
 
     def limits(law: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
