@@ -122,7 +122,7 @@ def pool_quiet(
     functions: of the law, those of the basis. quiet: with states in the order of the relations'.
     Raises ValueError for terms of inputs: what rests depends on theirs.
     """
-    if not quiet:
+    if not (quiet and len(size)):
         return pool_rows(rows, basis, size)
     if inputs := [v for v in library.variables if v not in relations.common.states]:
         raise ValueError(
@@ -219,9 +219,11 @@ class RestingModel:
         y, weighted = np.zeros(len(self.point.rest)), self._equation * coef
         for _ in range(N_NEWTON):
             terms = self._terms(y)
-            rates = weighted @ terms[0, 0]
-            y = y - np.linalg.pinv(weighted @ terms[1:, 0].T) @ rates
-            if not np.abs(y).max() < 1.0:  # or not a number
+            rates, jacobian = weighted @ terms[0, 0], weighted @ terms[1:, 0].T
+            if not np.isfinite(jacobian).all():  # outside the domain of a function
+                return None
+            y = y - np.linalg.pinv(jacobian) @ rates
+            if not np.abs(y).max() < 1.0:
                 return None
             if np.abs(rates).max() < RESTING:
                 return y
