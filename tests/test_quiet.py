@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import ep2sindy as ep
-from ep2sindy.operating.law import OperatingLaw, constrain_law, make_basis
+from ep2sindy.operating.law import OperatingLaw, constrain_law
 from ep2sindy.operating.point_fits import PointFits, fit_rows
-from ep2sindy.operating.quiet import QuietPoint, RestingModel, pool_quiet, quiet_points
+from ep2sindy.operating.quiet import QuietPoint, RestingModel, quiet_points
 from tests.models import plain_rows
 
 STATES, TURN = ("x", "v"), 2.0 * np.pi
@@ -83,19 +83,8 @@ def fits(true: Callable[[float], ep.SparseModel]) -> PointFits:
     return fitted(true, {P: settled(true(P), 2.0) for P in LOUD})
 
 
-def pooled(
-    fits: PointFits, quiet: Sequence[QuietPoint], functions: ep.Library = LINE
-) -> OperatingLaw:
-    free = pool_quiet(
-        fits._rows,
-        make_basis(functions, fits.points),
-        fits._size,
-        functions=functions,
-        relations=fits.relations,
-        library=fits.models[0].library,
-        quiet=quiet,
-    )
-    return fits.relations.make_law(fits.models[0], functions, fits.points, free, None, "rows")
+def pooled(fits: PointFits, quiet: Sequence[QuietPoint]) -> OperatingLaw:
+    return replace(fits, quiet=quiet).law(LINE)
 
 
 def silent(true: Callable[[float], ep.SparseModel]) -> list[QuietPoint]:
@@ -121,6 +110,20 @@ def test_a_law_rests_where_the_record_does_and_keeps_its_cycles(
     for P in LOUD:
         own, record = settled(quiet.at(P=P), 2.0)[:, 0], settled(true(P), 2.0)[:, 0]
         assert own.std() == pytest.approx(record.std(), rel=within)
+
+
+def test_laws_without_a_point_rest_as_well() -> None:
+    """By these are the errors at points left out, and the covariance."""
+    fits_of = replace(fits(tube), quiet=silent(tube))
+    laws = [fits_of.law_without(k, LINE) for k in range(len(LOUD))]
+    assert max(growth(law, P) for law in laws for P in SILENT) < -0.0098
+    found, own = fits_of.law(LINE), fits_of.coefficients
+    for k, (law, error) in enumerate(zip(laws, found.left_out, strict=True)):
+        off, weight = law.coef @ [1.0, LOUD[k]] - own[k], fits_of.information[k]
+        assert error == pytest.approx(np.sqrt(off @ weight @ off / (own[k] @ weight @ own[k])))
+    coef = np.array([law.coef for law in laws]).reshape(len(laws), -1)
+    apart = coef - coef.mean(axis=0)
+    np.testing.assert_allclose(found.covariance, 0.8 * apart.T @ apart, rtol=1e-9, atol=1e-15)
 
 
 def test_a_law_that_is_quiet_already_is_unchanged() -> None:
@@ -237,12 +240,3 @@ def test_quiet_records_are_told_from_small_cycles(kind: str, is_quiet: bool) -> 
     # With hysteresis a point has both.
     both = quiet_points([[run("loud", 1.0), run("white", 1.0)]], STATES)
     assert [point.parameters["P"] for point in both] == [1.0]
-
-
-def test_a_law_with_inputs_cannot_be_asked_to_rest() -> None:
-    found = replace(fits(tube), quiet=silent(tube))
-    library = ep.polynomial([*STATES, "u"], degree=3)
-    coef = np.zeros((len(library), 2))
-    driven = ep.SparseModel(library, STATES, coef)
-    with pytest.raises(ValueError, match=r"terms of its states alone, got \['u'\] as well"):
-        replace(found, models=[driven, *found.models[1:]]).law_without(0, LINE)

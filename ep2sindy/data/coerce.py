@@ -187,10 +187,10 @@ class DiscoveryProblem:
         self._check_hidden()
         seen = [name for name in self.library.variables if name not in self.hidden]
         check_agreement(self.runs, seen)
-        roles = self.facts.roles
+        roles = self.at_point.facts.roles
         check_repeats(self.runs, coupled=roles is not None)
         if roles is not None:
-            self.at_point.facts.roles.processes(self.library, self.states)
+            roles.processes(self.library, self.states)
             for state in roles.positive:
                 check_nonnegative(state, [run.columns([state])[:, 0] for run in self.runs])
         for state in (*self.facts.excluded, *(state for state, _ in self.facts.places)):

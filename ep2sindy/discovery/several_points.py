@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ep2sindy.data.coerce import DiscoveryProblem
-from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.data.trajectory import Trajectory, point_label
 from ep2sindy.discovery.choice import join_choice
 from ep2sindy.discovery.method import Regression, TrajectorySearch
 from ep2sindy.discovery.result import Discovery, DiscoveryMethod, join_points
@@ -28,9 +28,17 @@ from ep2sindy.operating.law import (
     constrain_roles,
     read_law,
 )
-from ep2sindy.operating.left_out import LawChoice, LawTrial, choose_law, follow_together, test_trials
+from ep2sindy.operating.left_out import (
+    LawChoice,
+    LawTrial,
+    choose_law,
+    follow_together,
+    run_quiet,
+    test_trials,
+)
 from ep2sindy.operating.point_fits import PointFits, fit_rows, fit_trajectories
-from ep2sindy.operating.records import OperatingRecord, values_of
+from ep2sindy.operating.quiet import QuietPoint, quiet_points
+from ep2sindy.operating.records import OperatingRecord, branches_of, values_of
 from ep2sindy.refinement.problem import RefinementSettings
 from ep2sindy.refinement.windows import PERIODS
 from ep2sindy.regression.ambiguity import ambiguities
@@ -87,12 +95,12 @@ class LawSearch:
 class PointsProblem:
     """What is asked of several operating points together, and the method that answers it.
 
-    points: the runs of each point, by its label. law: None asks for one structure alone.
+    given: the runs of each point, by its label. law: None asks for one structure alone.
     Raises ValueError for hidden states, or a method that cannot weigh all points at once.
     """
 
     asked: DiscoveryProblem
-    points: Mapping[str, Sequence[Trajectory]]
+    given: Mapping[str, Sequence[Trajectory]]
     method: DiscoveryMethod
     law: LawSearch | None
     workers: Workers
@@ -135,6 +143,43 @@ class PointsProblem:
             return replace(WINDOWS, periods=self.regression.selection.window_periods)
         return LONG_WINDOWS if self.asked.made else WINDOWS
 
+    @cached_property
+    def quiet(self) -> list[QuietPoint]:
+        """Points whose records rest, where the law must; none unless all others repeat cycles."""
+        found = [] if self.law is None else quiet_points(self.given.values(), self.asked.states)
+        labels = {point_label(point.parameters) for point in found}
+        loud = [runs for label, runs in self.given.items() if label not in labels]
+        return found if loud and all(OperatingRecord(runs[0]).repeats for runs in loud) else []
+
+    @cached_property
+    def on_other_cycle(self) -> list[str]:
+        """Labels of points whose records are on another cycle than most, if two coexist."""
+        if self.law is None:
+            return []
+        quiet = {point_label(point.parameters) for point in self.quiet}
+        known = {k: r for k, runs in self.given.items() if (r := OperatingRecord(runs[0])).repeats}
+        loud = {label: record for label, record in known.items() if label not in quiet}
+        if len(loud) < 2:
+            return []
+        numbers = branches_of(list(loud.values()))
+        main = int(2 * numbers.sum() > len(numbers))
+        return [label for label, number in zip(loud, numbers, strict=True) if number != main]
+
+    @cached_property
+    def points(self) -> dict[str, Sequence[Trajectory]]:
+        """The runs of every point that is fitted."""
+        aside = {point_label(point.parameters) for point in self.quiet} | {*self.on_other_cycle}
+        return {label: runs for label, runs in self.given.items() if label not in aside}
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What is said of points that are not fitted."""
+        if not self.on_other_cycle:
+            return ()
+        n, others = len(self.points), ", ".join(self.on_other_cycle)
+        words = f"two cycles coexist: the law is that of {n} points; on the other cycle are {others}"
+        return (words,)
+
     @property
     def roles(self) -> Roles | None:
         return self.asked.facts.roles
@@ -172,7 +217,10 @@ class PointsProblem:
                 constraint=fits.relations.at(fits.points[[k]])[0],
                 records=same_point,
             )
-        return join_points(points, self.values, found)
+        if found is not None:
+            found = replace(found, quiet=run_quiet(found.law, self.quiet, self.given))
+        joined = join_points(points, self.values, found)
+        return replace(joined, data_warnings=(*joined.data_warnings, *self.notes))
 
     def _rows(self, rng: np.random.Generator, progress: Progress) -> Problems:
         """Rows of every point, made in the order of their names, so that theirs does not count."""
@@ -269,7 +317,7 @@ class _Search:
         rows = [
             fit_rows(
                 one.parameters, one.values, list(self.problems.values()), structure,
-                provenance=one.regression.provenance,
+                provenance=one.regression.provenance, quiet=one.quiet,
             )
             for structure in structures
         ]  # fmt: skip

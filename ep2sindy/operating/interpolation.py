@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -57,13 +58,27 @@ class Interpolation:
 
     @staticmethod
     def of(
-        functions: Library,
-        points: Float[np.ndarray, "points parameters"],
-        records: Sequence[OperatingRecord],
+        functions: Library, records: Sequence[OperatingRecord], states: Sequence[str]
     ) -> Interpolation:
-        """Between records with a cycle; points in the order of the functions' variables."""
-        cycles = np.array([(r.cycle.frequency_Hz, *r.cycle.std) for r in records])
-        return Interpolation(functions, points, tuple(records[0].run.state_names), cycles)
+        """Of some states between records. Raises ValueError for a record without a cycle."""
+        names, columns = functions.variables, [records[0].run.state_names.index(s) for s in states]
+        points = read_points([{n: r.parameters[n] for n in names} for r in records], names)
+        cycles = np.array([(r.cycle.frequency_Hz, *r.cycle.std[columns]) for r in records])
+        return Interpolation(functions, points, tuple(states), cycles)
+
+    @staticmethod
+    def best(
+        several: Sequence[Library], records: Sequence[OperatingRecord], states: Sequence[str]
+    ) -> Interpolation | None:
+        """That of the functions by which points left out are missed least, in the mean.
+
+        None if a record has no cycle, or if there are too few points for any.
+        """
+        found = []
+        for functions in several:
+            with suppress(ValueError):
+                found.append(Interpolation.of(functions, records, states))
+        return min(found, key=lambda each: float(each.errors.mean()), default=None)
 
     @cached_property
     def _basis(self) -> Basis:

@@ -13,12 +13,10 @@ from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Constraint
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.restarts import MOVED, Restarts
-from ep2sindy.operating.law import make_basis
 from ep2sindy.operating.point_fits import PointFits
 from ep2sindy.refinement.refine import with_coef
 from ep2sindy.refinement.windows import dominant_window
 from ep2sindy.regression.constrained import read_coefficients
-from ep2sindy.regression.pooled import pool_rows
 
 N_WINDOWS = 20  # of every record
 
@@ -45,9 +43,7 @@ def follow_windows(
     fits: of each point alone, with which it begins. runs: one record of each point. periods: in
     each of the windows.
     """
-    basis, at = make_basis(functions, fits.columns(functions)), functions.evaluate(
-        fits.columns(functions)
-    )  # fmt: skip
+    at = functions.evaluate(fits.columns(functions))
     best, law, tried = _Linearised([], np.inf), fits.pool(functions), fits.pool(functions)
     ahead, fraction = law, 1.0
     for _ in range(MOST_STEPS):
@@ -57,7 +53,7 @@ def follow_windows(
             best, law, fraction = found, tried, 1.0
             if gain < SETTLED * found.loss:
                 break
-            ahead = pool_rows(best.rows, basis, fits.size)
+            ahead = replace(fits, rows=best.rows).pool(functions)
         else:
             fraction *= CUT
             if fraction < SMALLEST:
@@ -124,6 +120,6 @@ def _linearise(
     basis, _ = np.linalg.qr(moves[known])
     rows = (rows - basis @ (basis.transpose(0, 2, 1) @ rows)).reshape(-1, len(z) + 1)
     loss = float(np.square(rows[:, -1]).mean())
-    triangle = np.linalg.qr(rows / np.sqrt(len(rows)), mode="r")
+    triangle: np.ndarray = np.linalg.qr(rows / np.sqrt(len(rows)), mode="r")
     share = float(known.mean())
     return triangle[: len(z), :-1], triangle[: len(z), -1], share * loss + (1.0 - share) * LOST

@@ -10,20 +10,25 @@ from math import isfinite
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.data.trajectory import Trajectory, point_label
 from ep2sindy.forecasting.evaluation import Evaluation, evaluate
 from ep2sindy.library.library import Library
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.restarts import Restarts
+from ep2sindy.model.rollout import simulate
 from ep2sindy.model.stability import ATTRACTING_BELOW
-from ep2sindy.operating.law import LawFunctions, OperatingLaw, in_hull, make_basis, read_law
+from ep2sindy.operating.interpolation import Interpolation
+from ep2sindy.operating.law import LawFunctions, OperatingLaw, in_hull, read_law
 from ep2sindy.operating.law_fit import follow_windows
-from ep2sindy.operating.point_fits import PointFits
+from ep2sindy.operating.point_fits import PointFits, usual_functions
+from ep2sindy.operating.quiet import SMALL, QuietPoint
 from ep2sindy.operating.records import OperatingRecord
 from ep2sindy.refinement.windows import dominant_window
 from ep2sindy.regression.pooled import fewest_of_least
 from ep2sindy.runtime.parallel import SURROUNDING, Workers, collect
 from ep2sindy.runtime.progress import SILENT, Progress
+
+Runs = Mapping[str, Sequence[Trajectory]]  # by the label of their operating point
 
 N_WINDOWS = 20  # of every record that is left out
 
@@ -31,13 +36,18 @@ N_WINDOWS = 20  # of every record that is left out
 # between the records: else their frequencies and amplitudes are better interpolated.
 TRUSTED = 0.75
 
+HOLDS = 0.9  # part of its own records at which a law must hold, to be preferred to one that fails
+
+# Runs at quiet points: periods, samples, and those of the record's end that a run begins with.
+LONG, N_SAMPLES, N_LAST = 100.0, 2000, 5
+
 
 @dataclass(frozen=True, eq=False)
 class LeftOutRun:
     """A free run of one point with the law fitted to the other points.
 
     The run starts at one sample of the point's record. inside: True if the other points enclose
-    this one. interpolated: its errors of `interpolate`, or NaN where the others do not enclose it,
+    this one. interpolated: its errors of `Interpolation`, or NaN where the others do not enclose it,
     or do not repeat cycles.
     """
 
@@ -102,7 +112,7 @@ class LawTrial:
         """Whether the law holds at most of the records that it was fitted to."""
         if self.fits.models[0].inputs:
             return True  # which is not asked of a model that inputs drive
-        return sum(run.holds for run in self.fitted) >= TRUSTED * len(self.records)
+        return sum(run.holds for run in self.fitted) >= HOLDS * len(self.records)
 
     @property
     def between(self) -> Float[np.ndarray, " _"]:
@@ -183,41 +193,44 @@ def window_errors(
     return np.array(found)
 
 
-def interpolate(
-    functions: Library,
-    points: Float[np.ndarray, "points variables"],
-    records: Sequence[OperatingRecord],
-    assessed: Sequence[int],
-) -> Float[np.ndarray, "points 2"]:
-    """Errors at every point of frequency and amplitude interpolated between the other points.
-
-    No model has a part in it: the functions of a law are fitted to the frequencies, and to the
-    standard deviation of each state, of the other records. points: in the order of the functions'
-    variables. Returns the relative error of the frequency, and that of the worst amplitude.
-    Raises ValueError if the points do not suffice, or a record repeats no cycle.
-    """
-    own = np.array([(r.cycle.frequency_Hz, *r.cycle.std[list(assessed)]) for r in records])
-    off = np.abs(make_basis(functions, points, n_spare=1).predict_left_out(own) / own - 1.0)
-    return np.column_stack([off[:, 0], off[:, 1:].max(axis=1)])
-
-
-def run_left_out(trial: LawTrial) -> list[LeftOutRun]:
-    """Run every record freely with the law of the others, and interpolate between these."""
-    runs, functions = [], trial.functions
-    records, assessed, states = trial.records, trial.assessed, trial.fits.models[0].states
-    places = [states.index(name) for name in assessed or states]
-    try:
-        between = interpolate(functions, trial.fits.columns(functions), records, places)
-    except ValueError:
-        between = np.full((len(records), 2), np.nan)
-    for k, record in enumerate(records):
-        law = trial.fits.law_without(k, functions)
-        run = evaluate(read_law(law, record.parameters), record.from_slowest, assessed=assessed)
+def run_left_out(trial: LawTrial, between: Interpolation | None = None) -> list[LeftOutRun]:
+    """Run every record freely with the law of the others; beside it their interpolation."""
+    runs, errors = [], None if between is None else between.errors
+    for k, record in enumerate(trial.records):
+        law = trial.fits.law_without(k, trial.functions)
+        model = read_law(law, record.parameters)
+        run = evaluate(model, record.from_slowest, assessed=trial.assessed)
         inside = law.is_inside(record.parameters)
-        off = between[k] if inside else np.full(2, np.nan)
-        errors = dict(zip(("frequency", "amplitude"), off.tolist(), strict=True))
-        runs.append(LeftOutRun(record, run, inside, errors))
+        off = np.full(2, np.nan) if errors is None or not inside else errors[k]
+        interpolated = dict(zip(("frequency", "amplitude"), off.tolist(), strict=True))
+        runs.append(LeftOutRun(record, run, inside, interpolated))
     return runs
+
+
+@dataclass(frozen=True, eq=False)
+class QuietRun:
+    """The law of all points at one whose record is quiet, from the record's last state.
+
+    rests: whether the run stays as quiet as the record is.
+    """
+
+    record: Trajectory
+    rests: bool
+
+
+def run_quiet(law: OperatingLaw, points: Sequence[QuietPoint], runs: Runs) -> list[QuietRun]:
+    """Run the law at quiet points, for as long as the record or a hundred periods."""
+    found = []
+    for point in points:
+        for run in runs[point_label(point.parameters)]:
+            t = np.linspace(0.0, max(run.t[-1] - run.t[0], LONG * point.period_s), N_SAMPLES)
+            model = read_law(law, point.parameters)
+            end = np.nanmean(run.columns(model.states)[-N_LAST:], axis=0)
+            path = simulate(model, t, end, None, blow_up=1e3, reach=np.abs(end) + point.scale).states
+            late = path[N_SAMPLES // 2 :]
+            rests = np.isfinite(late).all() and (late.std(axis=0) < SMALL * point.scale).all()
+            found.append(QuietRun(run, bool(rests)))
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,12 +239,15 @@ class LawChoice:
 
     trials: all that was tried. choice: the one whose law is taken. cycle: name of the records'
     cycle; "all" if there is only one. runs: of the points left out, each with the law of the
-    others; empty if there are too few points, or if inputs drive the model.
+    others; empty if there are too few points, or if inputs drive the model. quiet: of the points
+    whose records are quiet. interpolation: of the records, without a model; None if there is none.
     """
 
     trials: Sequence[LawTrial]
     choice: LawTrial
     runs: Sequence[LeftOutRun]
+    quiet: Sequence[QuietRun] = ()
+    interpolation: Interpolation | None = None
     cycle: str = "all"
 
     @property
@@ -299,7 +315,7 @@ class LawChoice:
         return f"windows of the records are followed to {self.choice.error:.3g} standard deviations"
 
 
-def choose_law(trials: Sequence[LawTrial], *, cycle: str = "all") -> LawChoice:
+def choose_law(trials: Sequence[LawTrial]) -> LawChoice:
     """The trial of fewest numbers among those that err least at points left out between others.
 
     Laws that hold at the records that they were fitted to come before others. Of models that run
@@ -309,15 +325,18 @@ def choose_law(trials: Sequence[LawTrial], *, cycle: str = "all") -> LawChoice:
     """
     tested, first = [trial for trial in trials if len(trial.errors)], None
     left = [trial for trial in tested if trial.holds] or tested
+    one = trials[0]
+    states = one.assessed or one.fits.models[0].states
+    between = Interpolation.best(usual_functions(one.fits.parameters), one.records, states)
     while left:
         best = left.pop(fewest_of_least([(trial.between, trial.n_numbers) for trial in left]))
         if best.fits.models[0].inputs:
-            return LawChoice(trials, best, [], cycle)
-        found = LawChoice(trials, best, run_left_out(best), cycle)
+            return LawChoice(trials, best, [])
+        found = LawChoice(trials, best, run_left_out(best, between), interpolation=between)
         first = first or found
         if 2 * sum(run.run.holds or run.attracts for run in found.runs) > len(found.runs):
             return found
-    return first or LawChoice(trials, trials[-1], [], cycle)
+    return first or LawChoice(trials, trials[-1], [], interpolation=between)
 
 
 def error_statistics(left_out: Sequence[LeftOutRun]) -> dict[str, float | int]:
@@ -325,7 +344,7 @@ def error_statistics(left_out: Sequence[LeftOutRun]) -> dict[str, float | int]:
 
     A point without a frequency counts as an infinite frequency error, and does not enter the
     medians of amplitude and waveform. These are taken over each point's worst state. Over the
-    points that the others enclose, the medians of the law stand next to those of `interpolate`.
+    points that the others enclose, the medians of the law stand next to those of `Interpolation`.
     """
     f = np.array([abs(each.run.f_error) for each in left_out])
     f[np.isnan(f)] = np.inf

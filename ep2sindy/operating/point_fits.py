@@ -18,6 +18,7 @@ from ep2sindy.library.library import Library, named_terms, polynomial
 from ep2sindy.library.relations import Constraint
 from ep2sindy.model.model import SparseModel
 from ep2sindy.operating.law import LawConstraint, LawFunctions, OperatingLaw, make_basis
+from ep2sindy.operating.quiet import QuietPoint, pool_quiet
 from ep2sindy.refinement.assess import RefinementStatus
 from ep2sindy.refinement.problem import RefinementSettings
 from ep2sindy.refinement.refine import refine
@@ -29,7 +30,6 @@ from ep2sindy.regression.constrained import (
 from ep2sindy.regression.pooled import (
     fewest_of_least,
     invert_covariance,
-    pool_rows,
     residuals_left_out,
     root_of,
 )
@@ -62,7 +62,8 @@ class PointFits:
     trajectories the inverse covariance of the refinement. Directions that a point does not
     determine leave the law free there. Every I_p is scaled so that all points weigh alike, whatever
     the noise of their records.
-    Assumes that one law holds at all points.
+    Assumes that one law holds at all points. At quiet points, of which nothing was fitted, every
+    law rests as their records do (`pool_quiet`).
     points: (points, parameters). relations: that hold at every point. models: one per point.
     information: of the free coefficients, in SI; zero of a fit that failed. how: "rows" or
     "trajectories". statuses, losses: of the refinement at each point; empty for rows. rows: R_p and
@@ -79,15 +80,7 @@ class PointFits:
     statuses: Sequence[str] = ()
     losses: Sequence[float] = ()
     rows: Sequence[tuple[Float[np.ndarray, "free free"], Float[np.ndarray, " free"]]] | None = None
-
-    def at(self, numbers: Sequence[int]) -> PointFits:
-        """The fits of some of the points."""
-        kept = list(numbers)
-        statuses, losses = ([v[k] for k in kept] if v else () for v in (self.statuses, self.losses))
-        return replace(
-            self, points=self.points[kept], models=[self.models[k] for k in kept],
-            information=self.information[kept], statuses=statuses, losses=losses,
-        )  # fmt: skip
+    quiet: Sequence[QuietPoint] = ()
 
     @property
     def n_free(self) -> int:
@@ -113,7 +106,7 @@ class PointFits:
             return [polynomial(list(self.parameters), degree=law)]
         if isinstance(law, Library):
             return [law]
-        several = self._usual_functions() if isinstance(law, str) else law
+        several = usual_functions(self.parameters) if isinstance(law, str) else law
         tested, reasons = self.test_laws(several)
         if not tested:
             raise ValueError([*reasons, "law=[...] must name degrees or functions"][0])
@@ -127,13 +120,6 @@ class PointFits:
     def functions(self, law: LawFunctions | Sequence[LawFunctions]) -> Library:
         """The likeliest functions of a law; see `candidates`."""
         return self.candidates(law)[0]
-
-    def _usual_functions(self) -> list[Library]:
-        names = list(self.parameters)
-        own = [[(), (f"{p}^2",), (f"1/{p}",), (f"{p}^2", f"1/{p}")] for p in names]
-        sets = [[*chain(*more)] for more in product(*own)] if len(names) <= MANY else [[]]
-        usual = [named_terms(names, ["1", *names, *more]) for more in sets]
-        return [*usual, polynomial(names, degree=2)]
 
     def test_laws(
         self, laws: Sequence[LawFunctions]
@@ -192,6 +178,11 @@ class PointFits:
         """
         basis = make_basis(functions, self.columns(functions), n_spare=1)
         missed = residuals_left_out(self._rows, basis, self.size)
+        if self.quiet:
+            missed = [
+                y - theta @ self.pool(functions, without=k) @ basis.values[k]
+                for k, (theta, y) in enumerate(self._rows)
+            ]
         pairs = zip(missed, self._rows, strict=True)
         return np.array([norm(off) / norm(y) if y.any() else 1.0 for off, (_, y) in pairs])
 
@@ -201,7 +192,10 @@ class PointFits:
         """The law W of the free coefficients, of all points or without one."""
         kept = [k for k in range(len(self.models)) if k != without]
         basis = make_basis(functions, self.columns(functions)[kept])
-        return pool_rows([self._rows[k] for k in kept], basis, self.size)
+        return pool_quiet(
+            [self._rows[k] for k in kept], basis, self.size, functions=functions,
+            relations=self.relations, library=self.models[0].library, quiet=self.quiet,
+        )  # fmt: skip
 
     @cached_property
     def size(self) -> Float[np.ndarray, " free"]:
@@ -218,6 +212,15 @@ class PointFits:
         return [(root, root @ own) for root, own in zip(roots, self.coefficients, strict=True)]
 
 
+def usual_functions(parameters: Sequence[str]) -> list[Library]:
+    """Functions that records often need: p and, or not, p^2 and 1/p; or degree 2."""
+    names = list(parameters)
+    own = [[(), (f"{p}^2",), (f"1/{p}",), (f"{p}^2", f"1/{p}")] for p in names]
+    sets = [[*chain(*more)] for more in product(*own)] if len(names) <= MANY else [[]]
+    usual = [named_terms(names, ["1", *names, *more]) for more in sets]
+    return [*usual, polynomial(names, degree=2)]
+
+
 def fit_rows(
     parameters: Sequence[str],
     points: Float[np.ndarray, "points parameters"],
@@ -225,6 +228,7 @@ def fit_rows(
     relations: LawConstraint,
     *,
     provenance: Mapping[str, str],
+    quiet: Sequence[QuietPoint] = (),
 ) -> PointFits:
     """Fit the coefficients to the rows of each point.
 
@@ -243,7 +247,9 @@ def fit_rows(
             model = replace(model, covariance=None)
         models.append(model)
         information.append(solution.information)
-    return PointFits(tuple(parameters), points, relations, models, np.array(information), "rows")
+    return PointFits(
+        tuple(parameters), points, relations, models, np.array(information), "rows", quiet=quiet
+    )
 
 
 def _blocks(

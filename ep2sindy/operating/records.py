@@ -74,6 +74,14 @@ class OperatingRecord:
         return cycle
 
     @property
+    def repeats(self) -> bool:
+        """Whether the record holds enough periods of a cycle."""
+        try:
+            return self.cycle is not None
+        except ValueError:
+            return False
+
+    @property
     def relative_amplitude(self) -> float:
         """Standard deviation over mean of the waveform: see `spectrum.relative_amplitude`."""
         return relative_amplitude(self.cycle.mean, self.cycle.std)
