@@ -147,13 +147,14 @@ def test_a_search_by_mass_action_proposes_positive_processes_alone(record):
     found = ep.discover(record, LIBRARY.with_roles(MASS_ACTION), method)
     assert found.model.terms("n_i") == pytest.approx({"n_i": -A, "n_n": S, "n_i*n_n": R}, rel=1e-3)
     rows = ep.Differential().assemble([record], LIBRARY, rng=np.random.default_rng(0))
-    task = DiscoveryProblem([record], LIBRARY.with_roles(MASS_ACTION))
-    ((systems, free),) = (
-        [[s.systems for s in search_conserving_systems([(task, rows)], method.search, depth=50)]]
-    )
+    proposed = []
+    for roles in (MASS_ACTION, ROLES):
+        task = DiscoveryProblem([record], LIBRARY.with_roles(roles))
+        (own,) = search_conserving_systems([(task, rows)], method.search, depth=50)
+        proposed.append(own.systems)
+    systems, free = proposed
     assert len(systems) > 4
     assert not any(system.broken(system.model) for system in systems)
-    free = search_conserving_systems(rows, task, ROLES, method.search, depth=50).systems
     amounts = [amount for system in free for _, amount in amounts_of(system)]
     assert min(amounts) < 0.0  # without mass action some are negative
 
