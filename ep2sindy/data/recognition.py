@@ -31,6 +31,7 @@ from ep2sindy.data.quantities import (
     last_of,
     own_unit,
     quantity_of,
+    split_unit,
     step_given_by,
     words_of,
 )
@@ -295,10 +296,18 @@ class _Arrays:
         }
         fit = [each for each in rest if self._fits(each, known, lengths)]
         meant: dict[str, dict[str, str]] = {}  # our name -> names in the file, with their units
+        electrons: dict[str, str] = {}  # which have the density of the ions
         for each in fit:
             unit = "" if each.unit == "1" else each.unit
             if (quantity := quantity_of(each.name, unit, plasma=self.plasma)) is not None:
                 meant.setdefault(quantity[0], {})[each.name] = quantity[1]
+            base, ending = split_unit(last_of(each.name))
+            unit = unit or ending
+            if words_of(base) in ELECTRONS and (converts("n_i", unit) if unit else self.plasma):
+                electrons[each.name] = unit
+        if "n_n" in meant and "n_i" not in meant and len(electrons) == 1:
+            meant["n_i"] = electrons
+            self.questions.append(f"{next(iter(electrons))!r} is taken as n_i, by quasi-neutrality")
         found: dict[str, Variable] = {}
         for ours, options in meant.items():
             if len(options) == 1 or ours in options:
