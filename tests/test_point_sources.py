@@ -91,3 +91,12 @@ def test_pieces_depend_on_the_files_of_a_pattern(here: Path) -> None:
     before = pieces_key(settings)
     Path("V3.nc").write_bytes(Path("V2.nc").read_bytes())
     assert pieces_key(settings) != before
+
+
+def test_a_steady_record_is_a_point_without_a_run(here: Path) -> None:
+    write_files()
+    still = xr.load_dataset("V1.nc", engine="h5netcdf")
+    still.assign(x=0.0 * still["x"] + 3.0).to_netcdf("V1.nc", engine="h5netcdf")
+    opened = [source.open([]) for source in sources("points.files=V*.nc", ASKED)]
+    assert [point.status for point in opened] == ["oscillating", "steady", "oscillating"]
+    assert opened[1].run is None

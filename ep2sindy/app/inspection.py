@@ -59,12 +59,9 @@ def main(arguments: Sequence[str]) -> None:
     parser = argparse.ArgumentParser("ep2sindy inspect", description=ABOUT)
     parser.add_argument("path", nargs="+", help="file, folder.zarr or pattern")
     parser.add_argument(
-        "--write",
-        nargs="?",
-        const="",
-        metavar="NAME",
+        "--write", nargs="?", const="", metavar="NAME",
         help="write conf/data/NAME.yaml for data=NAME; by default the name of the first file",
-    )
+    )  # fmt: skip
     parser.add_argument(
         "--plasma", action="store_true",
         help="names such as Te are quantities without a unit, too; what has no unit is in SI",
@@ -92,7 +89,7 @@ def main(arguments: Sequence[str]) -> None:
         lines, end = [], differing
     elif given.write is None:
         path = _hydra(given.path)
-        first, is_plasma = as_plasma(found[0], axes) if pattern else (found[0], False)
+        first, is_plasma = as_plasma(found[0], axes)
         more = settings_of(axes, plasma=given.plasma or is_plasma)
         found = [first, *found[1:]]
         lines = commands(found, "recognised", pattern, path=path, more=more, drives=drives)
@@ -185,8 +182,11 @@ def as_plasma(found: Inspection, axes: Mapping[str, Variable]) -> tuple[Inspecti
 
     Units that the file does not state are asked for.
     """
-    plasma, needed = recognise(found.source, given=axes, plasma=True), NEEDS["breathing"]
-    if plasma.lacking(needed) or not found.lacking(needed):
+    needed = NEEDS["breathing"]
+    if not found.lacking(needed):
+        return found, False
+    plasma = recognise(found.source, given=axes, plasma=True)
+    if plasma.lacking(needed):
         return found, False
     bare = {one.name for one in plasma.held if one.unit in ("", "1")}
     places = {**plasma.axes, **plasma.variables}.items()

@@ -350,7 +350,8 @@ class _Arrays:
             part = ", ".join([":", *["0"] * (len(one.shape) - 1)])
             self.questions.append(
                 f"{one.name!r} of shape {one.shape} has an axis without a coordinate: name it, "
-                f"such as data.z.name=NAME, or take part of the array, such as {one.name}[{part}]"
+                "such as data.z.name=NAME, or points.axes=[NAME] if it is of operating points, or "
+                f"take part of the array, such as {one.name}[{part}]"
             )
         return len(ways) == 1
 
@@ -361,13 +362,6 @@ class _Arrays:
         texts = ", ".join(f"{name!r} for {q[0]}" for name, q in meant.items() if q)
         if texts and not self.plasma and {*found} & {*KNOWN_UNITS}:
             self.questions.append(f"data.plasma=true takes {texts}, and what has no unit for SI")
-        if "n_i" not in found:
-            self.questions.extend(
-                f"in a quasi-neutral plasma {e.name!r} is n_i: say so in the mapping that --write "
-                "makes"
-                for e in rest
-                if words_of(last_of(e.name)) in ELECTRONS
-            )
 
 
 def _step_in_s(times: ArrayInfo, unit: str) -> float:

@@ -323,22 +323,18 @@ def parameters_in(
 
 def points_on_axes(
     path: str | Path, names: Sequence[str], units: Mapping[str, str]
-) -> list[tuple[dict[str, float], dict[str, float]]]:
+) -> list[list[dict[str, float]]]:
     """Every combination of the values of some axes of a file: as the file says them, and in SI.
 
     Raises ValueError for a name that is no vector of the file.
     """
-    source, ways = open_record(path), []
-    for name in names:
-        own = source.axis(name)
-        pairs = zip(own.values.tolist(), _in_si(name, own, units).values.tolist(), strict=True)
-        ways.append(list(pairs))
+    source = open_record(path)
+    own = {name: source.axis(name) for name in names}
+    in_si = {name: _in_si(name, points, units) for name, points in own.items()}
     return [
-        (
-            {name: own for name, (own, _) in zip(names, at, strict=True)},
-            {name: in_si for name, (_, in_si) in zip(names, at, strict=True)},
-        )
-        for at in product(*ways)
+        [{n: float(v[at[n]]) for n, v in axes.items()} for axes in (own, in_si)]
+        for ks in product(*(range(points.size) for points in own.values()))
+        for at in [dict(zip(names, ks, strict=True))]
     ]
 
 

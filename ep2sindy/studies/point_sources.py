@@ -102,16 +102,15 @@ def _of_files(
             "names, 'points.files=runs/V{V}.csv', or '+parameters={V: null}' for what the files "
             f"state, got {files!r}"
         )
-    given = []
+    given, units = [], settings.get("units") or {}
     for file, named in found.items():
-        point = dict(named)
+        point: dict[str, Any] = {**named, "data": {"path": file}}
         if missing := [name for name in names if name not in named]:
             with file_named(Path(file)):
                 inside = inspect_file(file, plasma=bool(settings.get("plasma")))
-                own = parameters_in(inside, missing, settings.get("units") or {})
-                point |= {name: float(value) for name, value in own.items()}
-        given.append({**point, "data": {"path": file}})
-    return sorted(given, key=lambda each: tuple(each[name] for name in names)), left_out
+                point |= {n: v.item() for n, v in parameters_in(inside, missing, units).items()}
+        given.append(point)
+    return sorted(given, key=lambda each: [each[name] for name in names]), left_out
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,11 +241,11 @@ def nothing_moves(statuses: Sequence[str]) -> str:
 
 
 def _parameters(given: Mapping[str, Any], names: Sequence[str]) -> dict[str, float]:
-    if set(given) - {"data"} != set(names) or not isinstance(given.get("data", {}), Mapping):
-        raise ValueError(f"a point must have {names}, and data where they differ: got {given!r}")
-    for name in names:
-        if type(given[name]) not in (int, float):
-            raise ValueError(f"points must give {name} as a number: got {given[name]!r}")
+    are_numbers = all(type(given.get(name)) in (int, float) for name in names)
+    if {*given} - {"data"} != {*names} or not are_numbers:
+        raise ValueError(
+            f"a point must have numbers for {names}, and data where they differ: got {given!r}"
+        )
     return {name: float(given[name]) for name in names}
 
 

@@ -89,15 +89,11 @@ class FileSource:
 
     def _read_at(self, points: xr.DataArray, place: int, name: str) -> xr.DataArray:
         array = self.read(name)
-        if self.dims_named:
-            own = [dim for dim in array.dims if dim in points.dims]
-        else:
-            own = [d for d, n in array.sizes.items() if array.ndim > 1 and n == points.size]
+        alike = [dim for dim, n in array.sizes.items() if array.ndim > 1 and n == points.size]
+        own = [dim for dim in array.dims if dim in points.dims] if self.dims_named else alike
         if len(own) > 1:
-            raise ValueError(
-                f"axes of points must differ in length from others: {name!r} has shape "
-                f"{array.shape}; name the dimensions, as NetCDF does"
-            )
+            sizes = f"{name!r} has shape {array.shape} and dimensions without names"
+            raise ValueError(f"an axis of points must differ in length from others: {sizes}")
         return array.isel(dict.fromkeys(own, place))
 
 
