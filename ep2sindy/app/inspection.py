@@ -82,7 +82,7 @@ def main(arguments: Sequence[str]) -> None:
     if pattern:
         say("\n".join(point_lines(pattern)))
     name = re.sub(r"\W+", "_", given.write or _word_for(found[0].source.path)).strip("_")
-    differing = unlike(found)
+    differing, flat = unlike(found), ["+trajectory.axisymmetric=false"] * ("r" in axes)
     if differing and given.write is not None:
         raise ValueError(f"no mapping is written: {differing}")
     if differing:
@@ -90,14 +90,14 @@ def main(arguments: Sequence[str]) -> None:
     elif given.write is None:
         path = _hydra(given.path)
         first, is_plasma = as_plasma(found[0], axes)
-        more = settings_of(axes, plasma=given.plasma or is_plasma)
+        more = [*settings_of(axes, plasma=given.plasma or is_plasma), *flat]
         found = [first, *found[1:]]
         lines = commands(found, "recognised", pattern, path=path, more=more, drives=drives)
         end = f"--write writes this to conf/data/{name}.yaml, for data={name}"
     else:
         file = own_config(name)
         write_text(file, config_text(found, paths))
-        lines, end = commands(found, name, pattern, drives=drives), f"written: {file}"
+        lines, end = commands(found, name, pattern, more=flat, drives=drives), f"written: {file}"
     header = ["next, for example:"] if lines else []
     say("\n".join([*header, *(f"  {line}" for line in lines), end]))
 
@@ -128,13 +128,12 @@ def commands(
 
     group: name in the data group. pattern: of files that are operating points, which are studied as
     such where an experiment has all that it needs. path: for the group `recognised`, which
-    names no file, and in which `more`, an axis and units are given too. drives: see `inputs_of`.
+    names no file, and in which units are given too. more: settings. drives: see `inputs_of`.
     """
     first, inputs = found[0], [name for name, _ in drives]
-    data = [f"data={group}", *[STEP] * bool(first.no_time)]
-    if group == "recognised":
-        units = ",".join(f"{name}:UNIT" for name in first.no_unit if name not in SPACE)
-        data += [*more, *[f"data.units={{{units}}}"] * bool(units)]
+    units = ",".join(f"{name}:UNIT" for name in first.no_unit if name not in SPACE)
+    asked = [f"data.units={{{units}}}"] * bool(units and group == "recognised")
+    data = [f"data={group}", *[STEP] * bool(first.no_time), *more, *asked]
     lines: list[list[str]] = []
     if pattern is not None:
         lines = point_commands(first, [*data, f"points.files={pattern.text}"], inputs)
@@ -195,10 +194,9 @@ def as_plasma(found: Inspection, axes: Mapping[str, Variable]) -> tuple[Inspecti
 
 
 def settings_of(axes: Mapping[str, Variable], *, plasma: bool) -> list[str]:
-    """Settings of the group `recognised` for axes on a plane, and for names of a plasma."""
+    """Settings of the group `recognised` for axes by hand, and for names of a plasma."""
     of_axes = [f"data.{n}={{name:{v.name},unit:{v.unit or 'UNIT'}}}" for n, v in axes.items()]
-    flat = ["+trajectory.axisymmetric=false"] * ("r" in axes)
-    return [*["data.plasma=true"] * plasma, *of_axes, *flat]
+    return [*["data.plasma=true"] * plasma, *of_axes]
 
 
 def inputs_of(found: Inspection) -> list[tuple[str, str]]:

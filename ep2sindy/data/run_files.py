@@ -239,7 +239,7 @@ def read_runs(
             point = {name: _in_si(name, xr.DataArray(named[name]), units) for name in named}
             asked = [name for name in parameters if name not in named]
             point |= parameters_in(found, asked, {**units, **given})
-        used = {n for n, v in found.variables.items() if {n, v.name} & {*parameters, *inputs}}
+        used = {n for n, v in found.variables.items() if {n, v.name} & {*point, *inputs}}
         free = (n for n in found.varying if n not in used and "time" in field[n].dims)
         varied |= dict.fromkeys(name for name in free if not is_counter_name(name))
         opened.append((file, field, point))

@@ -9,6 +9,8 @@ from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
 
+import xarray as xr
+
 from ep2sindy.data.open import inspect_file
 from ep2sindy.data.quantities import STEP_DOUBT
 from ep2sindy.data.readers.source import file_named
@@ -124,6 +126,11 @@ class PointSource:
     def label(self) -> str:
         return point_label(self.parameters)
 
+    def run(self, field: xr.Dataset, inputs: Sequence[str]) -> Trajectory:
+        """The run of the point's field, which carries the point."""
+        run = self.source.trajectory.trajectory(field, inputs=inputs, label=self.label)
+        return replace(run, parameters=self.parameters)
+
     def open(self, inputs: Sequence[str]) -> OpenedPoint:
         """Open or simulate the point; one that does not oscillate comes without a run.
 
@@ -135,12 +142,10 @@ class PointSource:
                 field = self.source.field()
                 if (status := field.attrs.get("status")) in WITHOUT_BREATHING:
                     return replace(opened, status=status)
-                sampling = self.source.trajectory
-                run = sampling.trajectory(field, inputs=inputs, label=self.label)
-                run = replace(run, parameters=self.parameters)
+                run = self.run(field, inputs)
                 doubts = [field.attrs[STEP_DOUBT]] if STEP_DOUBT in field.attrs else []
                 notes = amiss(field.attrs) if is_simulation(field.attrs) else doubts
-                words = [field.attrs.get("file", ""), sampling.place(field)]
+                words = [field.attrs.get("file", ""), self.source.trajectory.place(field)]
                 used = "; ".join(word for word in words if word)
                 return replace(opened, run=run, notes=notes, used=used)
             except DivergedError:
