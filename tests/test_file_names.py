@@ -193,6 +193,6 @@ def test_a_grid_of_densities_without_units_is_breathing_if_you_say_so(
     (line,) = re.findall(r"ep2sindy (\+exp=.*)", capsys.readouterr().out)
     assert shlex.split(line) == [
         "+exp=breathing", "data=recognised", "data.plasma=true", "data.z={name:x,unit:UNIT}",
-        "data.units={time:UNIT,n_n:UNIT,n_i:UNIT}", "points.files=pic_U{U}.h5",
+        "data.units={time:UNIT,n_i:UNIT,n_n:UNIT}", "points.files=pic_U{U}.h5",
         "data.channel_m=LENGTH",
     ]  # fmt: skip

@@ -118,7 +118,7 @@ def test_without_units_short_names_stay_and_what_is_plasma_is_offered(tmp_path: 
 @pytest.mark.parametrize(
     ("columns", "ours"),
     [
-        (("ne_m3", "neutral_density"), ["n_n", "n_i"]),  # a plasma is quasi-neutral
+        (("ne_m3", "neutral_density"), ["n_i", "n_n"]),  # a plasma is quasi-neutral
         (("ne_m3", "neutral_density", "ni_m3"), ["n_n", "n_i", "ne_m3"]),
         (("ne", "neutral_density"), ["n_n", "ne"]),
         (("ne_m3", "x"), ["ne_m3", "x"]),  # no discharge, for all that is known

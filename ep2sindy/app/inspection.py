@@ -77,9 +77,7 @@ def main(arguments: Sequence[str]) -> None:
     say("\n".join(found[0].lines([*experiments(found[0]), *notes])) + "\n")
     if len(found) > 1:
         say("\n".join(compare_files(found[0], found[1:])) + "\n")
-    names = [path for path in paths if isinstance(path, str)]
-    pattern = propose_pattern(names) if len(paths) > 1 else None
-    if pattern:
+    if pattern := propose_pattern([path for path in paths if isinstance(path, str)]):
         say("\n".join(point_lines(pattern)))
     name = re.sub(r"\W+", "_", given.write or _word_for(found[0].source.path)).strip("_")
     differing, flat = unlike(found), ["+trajectory.axisymmetric=false"] * ("r" in axes)

@@ -306,7 +306,7 @@ class _Arrays:
             if words_of(base) in ELECTRONS and (converts("n_i", unit) if unit else self.plasma):
                 electrons[each.name] = unit
         if "n_n" in meant and "n_i" not in meant and len(electrons) == 1:
-            meant["n_i"] = electrons
+            meant = {"n_i": electrons, **meant}
             self.questions.append(f"{next(iter(electrons))!r} is taken as n_i, by quasi-neutrality")
         found: dict[str, Variable] = {}
         for ours, options in meant.items():
