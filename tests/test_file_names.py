@@ -181,6 +181,23 @@ OWN = "+models={own: {terms: {Ibeam: ['1']}}}"
 T = np.linspace(0.0, 1.0, 60)
 
 
+def test_files_that_state_their_points_are_points(
+    here: Path, capsys: pytest.CaptureFixture
+) -> None:
+    for k, V in enumerate((200, 250, 300)):
+        table = pd.DataFrame({"t [us]": T, "Ibeam [A]": np.sin(V * T), "V_d [V]": V, "mdot": 4.6})
+        table.to_csv(f"shot_{k}.csv", index=False)
+    assert not ended("inspect", "shot_*.csv")
+    (line,) = re.findall(r"ep2sindy (\+exp=.*)", capsys.readouterr().out)
+    typed = shlex.split(line)
+    assert typed[2:] == [
+        "points.files=shot_*.csv", "+parameters={V_d:null}", "trajectory.states=[Ibeam]",
+    ]  # fmt: skip
+    study = study_of(Study, composed(*map(mend, [*typed, "~models", OWN])))
+    points = [dict(source.parameters) for source in study._given.sources]
+    assert points == [{"V_d": 200.0}, {"V_d": 250.0}, {"V_d": 300.0}]
+
+
 def test_a_grid_of_densities_without_units_is_breathing_if_you_say_so(
     here: Path, capsys: pytest.CaptureFixture
 ) -> None:

@@ -20,7 +20,7 @@ from ep2sindy.data.mapping import Variable, read_array
 from ep2sindy.data.open import inspect_file
 from ep2sindy.data.quantities import COORDINATE_UNITS, converts, last_of
 from ep2sindy.data.recognition import recognise
-from ep2sindy.data.run_files import FilePattern, propose_pattern
+from ep2sindy.data.run_files import FilePattern, parameters_stated, propose_pattern
 from ep2sindy.data.steps import records_of
 from ep2sindy.data.trajectory import point_label
 from ep2sindy.runtime.files import write_text
@@ -47,6 +47,7 @@ NEEDS: Mapping[str, tuple[str, ...]] = {
 }
 
 NOT_STATES = ("R_ion", "V_d")  # what drives a model
+MOST_STATED = 3  # more numbers that differ from file to file describe results
 # Columns and samples that are looked at for inputs: bounds of their number.
 MAX_LOOKED_AT, MIN_LOOKED_AT, MAX_SAMPLES = 20, 50, 50_000
 
@@ -79,6 +80,7 @@ def main(arguments: Sequence[str]) -> None:
         say("\n".join(compare_files(found[0], found[1:])) + "\n")
     if pattern := propose_pattern([path for path in paths if isinstance(path, str)]):
         say("\n".join(point_lines(pattern)))
+    points = point_settings(found, pattern, given.path)
     name = re.sub(r"\W+", "_", given.write or _word_for(found[0].source.path)).strip("_")
     differing, flat = unlike(found), ["+trajectory.axisymmetric=false"] * ("r" in axes)
     if differing and given.write is not None:
@@ -90,12 +92,12 @@ def main(arguments: Sequence[str]) -> None:
         first, is_plasma = as_plasma(found[0], axes)
         more = [*settings_of(axes, plasma=given.plasma or is_plasma), *flat]
         found = [first, *found[1:]]
-        lines = commands(found, "recognised", pattern, path=path, more=more, drives=drives)
+        lines = commands(found, "recognised", points, path=path, more=more, drives=drives)
         end = f"--write writes this to conf/data/{name}.yaml, for data={name}"
     else:
         file = own_config(name)
         write_text(file, config_text(found, paths))
-        lines, end = commands(found, name, pattern, more=flat, drives=drives), f"written: {file}"
+        lines, end = commands(found, name, points, more=flat, drives=drives), f"written: {file}"
     header = ["next, for example:"] if lines else []
     say("\n".join([*header, *(f"  {line}" for line in lines), end]))
 
@@ -113,10 +115,23 @@ def point_lines(pattern: FilePattern) -> list[str]:
     ]
 
 
+def point_settings(
+    found: Sequence[Inspection], pattern: FilePattern | None, paths: Sequence[str]
+) -> list[str]:
+    """Settings of files that are operating points: by their names, or by what they state."""
+    if pattern is not None:
+        return [f"points.files={pattern.text}"]
+    names = parameters_stated(found)
+    if not 0 < len(names) <= MOST_STATED:
+        return []
+    stated = ",".join(f"{name}:null" for name in names)
+    return [f"points.files={_hydra(paths)}", f"+parameters={{{stated}}}"]
+
+
 def commands(
     found: Sequence[Inspection],
     group: str,
-    pattern: FilePattern | None,
+    points: Sequence[str] = (),
     *,
     path: str = "",
     more: Sequence[str] = (),
@@ -124,17 +139,17 @@ def commands(
 ) -> list[str]:
     """Commands that can be run with the data; placeholders in capitals are for the user.
 
-    group: name in the data group. pattern: of files that are operating points, which are studied as
-    such where an experiment has all that it needs. path: for the group `recognised`, which
-    names no file, and in which units are given too. more: settings. drives: see `inputs_of`.
+    group: name in the data group. points: settings of files that are operating points, which are
+    studied as such where an experiment has all that it needs. path: for the group `recognised`,
+    which names no file, and in which units are given too. more: settings. drives: see `inputs_of`.
     """
     first, inputs = found[0], [name for name, _ in drives]
     units = ",".join(f"{name}:UNIT" for name in first.no_unit if name not in SPACE)
     asked = [f"data.units={{{units}}}"] * bool(units and group == "recognised")
     data = [f"data={group}", *[STEP] * bool(first.no_time), *more, *asked]
     lines: list[list[str]] = []
-    if pattern is not None:
-        lines = point_commands(first, [*data, f"points.files={pattern.text}"], inputs)
+    if points:
+        lines = point_commands(first, [*data, *points], inputs)
     if not lines:
         data = [*data[:1], *([f"data.path={path}"] if path else []), *data[1:]]
         lines = record_commands(first, data, inputs, are_several=len(found) > 1)

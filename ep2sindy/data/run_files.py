@@ -297,11 +297,7 @@ def parameters_in(
     units: by name, where the file states none. The last part of a path, `set/Ud`, is a name, too.
     Raises ValueError for a parameter that the file lacks, and for one that varies.
     """
-    held = {one.name: one for one in found.held if one.low <= one.high}
-    attributes = found.source.attributes.items()
-    numbers = {n: float(v) for n, v in attributes if not isinstance(v, str)}
-    held |= {n: ArrayInfo(n, low=v, high=v) for n, v in numbers.items()}
-    point = {}
+    held, point = _held_in(found), {}
     for name in names:
         places = [v.name for n, v in found.variables.items() if n == name]
         places += [name, *(n for n in held if last_of(n) == name)]
@@ -319,6 +315,25 @@ def parameters_in(
             )
         point[name] = _in_si(name, xr.DataArray(one.low, attrs={"units": one.unit}), units)
     return point
+
+
+def parameters_stated(files: Sequence[Inspection]) -> list[str]:
+    """Names of what every one of several files states as constant, and not all alike."""
+    points = [
+        {last_of(name): one.low for name, one in _held_in(each).items() if one.low == one.high}
+        for each in files
+    ]
+    shared = [name for name in points[0] if all(name in point for point in points)]
+    differ = [name for name in shared if len({point[name] for point in points}) > 1]
+    return [name for name in differ if name.isidentifier() and not is_counter_name(name)]
+
+
+def _held_in(found: Inspection) -> dict[str, ArrayInfo]:
+    """What a file holds of numbers, attributes among them."""
+    attributes = found.source.attributes.items()
+    numbers = {n: float(v) for n, v in attributes if not isinstance(v, str)}
+    held = {one.name: one for one in found.held if one.low <= one.high}
+    return held | {n: ArrayInfo(n, low=v, high=v) for n, v in numbers.items()}
 
 
 def points_on_axes(
