@@ -4,6 +4,9 @@ import re
 import shlex
 from pathlib import Path
 
+import h5py
+import numpy as np
+import pandas as pd
 import pytest
 
 from ep2sindy.app.arguments import mend
@@ -67,6 +70,7 @@ def test_a_pattern_takes_signs_of_the_shell_and_a_quantity_twice(here: Path) -> 
         # Names of shots and files, and dates, are no quantities.
         (["shot#101_U=250V.csv", "shot#103_U=300V.csv"], "shot#*_U={U}V.csv"),
         (["run_200V.csv", "run_300V.csv"], "run_{V}V.csv"),
+        (["avg_200V.csv", "avg_300V.csv"], "avg_{V}V.csv"),
         (["a7_20240131_120005.csv", "a8_20240201_120006.csv"], "a{a}_*.csv"),
         (["run2_2024-01-31_V7.csv", "run3_2024-02-01_V8.csv"], "run*_*_V{V}.csv"),
         (["Run 12a.csv", "Run 13a.csv"], None),
@@ -114,6 +118,8 @@ def test_the_pattern_may_be_typed_in_any_form(typed: str) -> None:
     assert composed("+exp=parametric", mend(typed)).points == "runs/V{V}_m{m}.csv"
     listed = "points=[{V_D_V: 300, mdot_mg_s: 5}]"
     assert mend(listed) == listed
+    assert mend("points.files=[a.csv,b.csv]") == "points=[a.csv,b.csv]"
+    assert mend("points.axes=[V,m]") == "points=[{axes: [V,m]}]"
 
 
 def swing(folder: Path, *values: float) -> None:
@@ -154,5 +160,56 @@ def test_an_inspection_of_a_glob_writes_the_list_and_the_command(
     printed = capsys.readouterr().out
     assert "  a=0.6: a0.6.csv\n  a=0.9: a0.9.csv\n  a=1.2: a1.2.csv\n" in printed
     (line,) = re.findall(r"ep2sindy (\+exp=.*)", printed)  # and no experiment on all as one system
-    study = study_of(Study, composed(*map(mend, shlex.split(line))))
-    assert list(study.models) == ["free"]
+    assert line == "+exp=breathing data=recognised 'points.files=a{a}.csv'"
+
+
+def test_one_signal_at_every_point_is_predicted(here: Path, capsys: pytest.CaptureFixture) -> None:
+    for U in (200, 250, 300):
+        table = pd.DataFrame({"t [us]": T, "Ibeam [A]": 3.0 + np.sin(U * T), "mdot [mg/s]": 4.6})
+        table.to_csv(f"tek{U}V.csv", index=False)
+    assert not ended("inspect", "tek*.csv")
+    (line,) = re.findall(r"ep2sindy (\+exp=.*)", capsys.readouterr().out)
+    typed = shlex.split(line)
+    assert typed[:3] == ["+exp=predict", "data=recognised", "points.files=tek{V}V.csv"]
+    assert typed[3:] == ["trajectory.states=[Ibeam]"]
+    study = study_of(Study, composed(*map(mend, [*typed, "~models", OWN])))
+    runs = [source.open([]).run for source in study._given.sources]
+    assert [run.parameters["V"] for run in runs if run] == [200.0, 250.0, 300.0]
+
+
+OWN = "+models={own: {terms: {Ibeam: ['1']}}}"
+T = np.linspace(0.0, 1.0, 60)
+
+
+def test_files_that_state_their_points_are_points(
+    here: Path, capsys: pytest.CaptureFixture
+) -> None:
+    for k, V in enumerate((200, 250, 300)):
+        table = pd.DataFrame({"t [us]": T, "Ibeam [A]": np.sin(V * T), "V_d [V]": V, "mdot": 4.6})
+        table.to_csv(f"shot_{k}.csv", index=False)
+    assert not ended("inspect", "shot_*.csv")
+    (line,) = re.findall(r"ep2sindy (\+exp=.*)", capsys.readouterr().out)
+    typed = shlex.split(line)
+    assert typed[2:] == [
+        "points.files=shot_*.csv", "+parameters={V_d:null}", "trajectory.states=[Ibeam]",
+    ]  # fmt: skip
+    study = study_of(Study, composed(*map(mend, [*typed, "~models", OWN])))
+    points = [dict(source.parameters) for source in study._given.sources]
+    assert points == [{"V_d": 200.0}, {"V_d": 250.0}, {"V_d": 300.0}]
+
+
+def test_a_grid_of_densities_without_units_is_breathing_if_you_say_so(
+    here: Path, capsys: pytest.CaptureFixture
+) -> None:
+    wave = 2.0 + np.sin(9.0 * T[:, None] + np.arange(4))
+    for U in (200, 250):
+        with h5py.File(f"pic_U{U}.h5", "w") as file:
+            file["moments/ne"], file["moments/nn"] = 1e17 * wave, 1e19 * wave[::-1]
+            file["x"], file["time"] = np.arange(4.0), T
+    assert not ended("inspect", "pic*.h5")
+    (line,) = re.findall(r"ep2sindy (\+exp=.*)", capsys.readouterr().out)
+    assert shlex.split(line) == [
+        "+exp=breathing", "data=recognised", "data.plasma=true", "data.z={name:x,unit:UNIT}",
+        "data.units={time:UNIT,n_i:UNIT,n_n:UNIT}", "points.files=pic_U{U}.h5",
+        "data.channel_m=LENGTH",
+    ]  # fmt: skip

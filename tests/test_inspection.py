@@ -115,6 +115,23 @@ def test_without_units_short_names_stay_and_what_is_plasma_is_offered(tmp_path: 
     assert "T_e_eV" in ep.inspect_file(tmp_path / "a.h5", plasma=True).variables
 
 
+@pytest.mark.parametrize(
+    ("columns", "ours"),
+    [
+        (("ne_m3", "neutral_density"), ["n_i", "n_n"]),  # a plasma is quasi-neutral
+        (("ne_m3", "neutral_density", "ni_m3"), ["n_n", "n_i", "ne_m3"]),
+        (("ne", "neutral_density"), ["n_n", "ne"]),
+        (("ne_m3", "x"), ["ne_m3", "x"]),  # no discharge, for all that is known
+    ],
+)
+def test_electrons_next_to_neutrals_count_the_ions(
+    columns: tuple[str, ...], ours: list[str], tmp_path: Path
+) -> None:
+    values = {name: WAVE[:, k, 0] for k, name in enumerate(columns)}
+    found = ep.inspect_file(write_csv(tmp_path / "a.csv", time_s=T, **values))
+    assert list(found.variables) == ours
+
+
 HEART = {"rate": 70.0 + WAVE[:, 0, 0], "te": 60.0 + WAVE[:, 1, 0]}
 
 

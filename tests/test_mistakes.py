@@ -16,7 +16,7 @@ from tests.programs import composed, ended
         (["+exp=breathin"], "unknown experiment 'breathin' (did you mean +exp=breathing?); choose"),
         (["+ex=breathing"], "an experiment is chosen with +exp=breathing, got '+ex=breathing'"),
         (["inspct", "run.csv"], "got 'inspct' (did you mean the command inspect, which stands fi"),
-        (["+exp=discover", "exclude={x: [x^2]}"], "must stand in double quotes inside single ones"),
+        (["+exp=discover", "exclude={x: [x(2]}"], "must stand in double quotes inside single ones"),
     ],
 )
 def test_a_misspelt_name_ends_in_our_words_with_the_nearest(
@@ -34,6 +34,7 @@ def test_a_misspelt_name_ends_in_our_words_with_the_nearest(
 
 def test_names_of_a_mapping_may_come_in_quotes() -> None:
     assert mend('exclude={"x": ["x^2"], \'y\': [x]}') == 'exclude={x: ["x^2"],y: [x]}'
+    assert mend("data.units={n_i:cm^-3}") == 'data.units={n_i:"cm^-3"}'
     assert mend("relations=['x: x == 1']") == "relations=['x: x == 1']"
     assert mend("~search") == "~search"
 

@@ -11,7 +11,7 @@ import xarray as xr
 
 import ep2sindy as ep
 from ep2sindy.data.runs import trajectories_of
-from ep2sindy.data.trajectory import check_agreement
+from ep2sindy.data.trajectory import ConstantStateError, check_agreement
 
 T = np.linspace(0.0, 1.0, 40)
 POINT = {"V_D_V": 0.1 + 0.2, "mdot_mg_s": 5}
@@ -126,12 +126,24 @@ def test_files_say_their_points_in_columns_scalars_and_attributes(here: Path) ->
     check_agreement(runs, [])
 
 
+def test_what_is_constant_in_every_file_is_no_state(here: Path) -> None:
+    write_table("a1.csv", **{"mdot [mg/s]": 4.6, "still": 1.0})
+    write_table("a2.csv", **{"mdot [mg/s]": 5.0, "still": np.sin(T)})
+    with pytest.raises(ConstantStateError, match="a1.csv: a state must vary: 'still'.*leave the f"):
+        ep.read_runs("a{a}.csv")
+    write_table("a2.csv", **{"mdot [mg/s]": 5.0, "still": 2.0})
+    runs = ep.read_runs("a{a}.csv", parameters=["mdot"])
+    assert [run.state_names for run in runs] == [("x", "y")] * 2
+    assert [run.parameters["mdot"] for run in runs] == pytest.approx([4.6e-6, 5e-6], rel=1e-15)
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
+        ({"parameters": ["U"]}, r"^a.csv: a parameter must be .*: 'U' is none of its \['V'\]"),
         (
             {"parameters": ["x"]},
-            "^a.csv: a parameter must be constant: 'x' has 40 values",
+            "^a.csv: a parameter must be constant: 'x' runs from -0.99",
         ),
         ({"files": ["a.csv", Path("../here/a.csv")]}, "every file may come once: .*a.csv comes ag"),
         ({"files": "field.nc", "states": ["n_i"]}, "^field.nc: a field over z needs a zone"),

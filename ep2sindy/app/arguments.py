@@ -36,9 +36,9 @@ NAMES = re.compile(
     r"""(?P<key>\+{0,2}(?:data|data\.path|output|signal))="""
     r"""(?P<value>(?!["']|\[.*\]$|.*\$\{)(?=.*[^A-Za-z0-9_/.*?-]).+)"""
 )
-# What is quoted, or a word with letters beyond ASCII; but not a name of a mapping.
+# What is quoted, or a word with ^ or letters beyond ASCII; but not a name of a mapping.
 LETTERS = re.compile(
-    r"""("(?:\\.|[^"\\])*"|'(?:\\.|[^'\\])*')|([^\s,[\]{}:=()"']*[^\x00-\x7f][^\s,[\]{}:=()"']*)(?!\s*:)"""
+    r"""("(?:\\.|[^"\\])*"|'(?:\\.|[^'\\])*')|([^\s,[\]{}:=()"']*[\^\x80-\U0010ffff][^\s,[\]{}:=()"']*)(?!\s*:)"""
 )
 
 
@@ -67,8 +67,10 @@ def mend(text: str) -> str:
     """A setting as Hydra's grammar takes it.
 
     Names of a mapping may come in quotes, names of files, folders and columns as they are, and the
-    files of points in any form.
+    files or axes of points in any form.
     """
+    text = re.sub(r"^points\.files=(?=\[.*\]$)", "points=", text)
+    text = re.sub(r"^points\.axes=(\[.*\])$", r"points=[{axes: \1}]", text)
     if pattern := FILES.fullmatch(text):
         text = f"points={_quoted(pattern['value'])}"
     elif name := NAMES.fullmatch(text):
@@ -122,7 +124,7 @@ def _unreadable(text: str, reason: str) -> str:
     if "=" in text or text.startswith("~"):
         return (
             f"{text!r} cannot be read as KEY=VALUE ({reason}); text that holds signs such as "
-            """^ ( { : , must stand in double quotes inside single ones: 'KEY="TEXT"', """
+            """( { : , must stand in double quotes inside single ones: 'KEY="TEXT"', """
             """'KEY={NAME: ["TEXT"]}'"""
         )
     return (

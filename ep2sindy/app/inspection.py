@@ -6,6 +6,7 @@ import argparse
 import re
 import shlex
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +14,13 @@ import numpy as np
 from omegaconf import OmegaConf
 
 from ep2sindy.app.config_files import conf_folder
+from ep2sindy.data.fields import SPACE
 from ep2sindy.data.inspection import STEP, Inspection, compare_files, unlike
 from ep2sindy.data.mapping import Variable, read_array
 from ep2sindy.data.open import inspect_file
-from ep2sindy.data.quantities import COORDINATE_UNITS
-from ep2sindy.data.run_files import FilePattern, propose_pattern
+from ep2sindy.data.quantities import COORDINATE_UNITS, converts, last_of
+from ep2sindy.data.recognition import recognise
+from ep2sindy.data.run_files import FilePattern, parameters_stated, propose_pattern
 from ep2sindy.data.steps import records_of
 from ep2sindy.data.trajectory import point_label
 from ep2sindy.runtime.files import write_text
@@ -36,15 +39,15 @@ NEEDS: Mapping[str, tuple[str, ...]] = {
     "ils": ("n_i", "n_n"),
     "theories": ("n_i", "n_n", "R_ion", "u_iz"),  # the last two for the balance of a file
     "parametric": ("n_i", "n_n", "R_ion", "u_iz"),
-    "predict": ("n_i", "n_n"),
+    "predict": (),
     "zones": ("n_i", "n_n"),
     "pointwise": ("n_i", "n_n", "R_ion", "u_iz"),
     "trace": (),
     "discover": (),
 }
 
-WITH_INFLOW = ("inflow", "conserving", "leaving")  # models of +exp=predict that need mdot_mg_s
 NOT_STATES = ("R_ion", "V_d")  # what drives a model
+MOST_STATED = 3  # more numbers that differ from file to file describe results
 # Columns and samples that are looked at for inputs: bounds of their number.
 MAX_LOOKED_AT, MIN_LOOKED_AT, MAX_SAMPLES = 20, 50, 50_000
 
@@ -57,12 +60,9 @@ def main(arguments: Sequence[str]) -> None:
     parser = argparse.ArgumentParser("ep2sindy inspect", description=ABOUT)
     parser.add_argument("path", nargs="+", help="file, folder.zarr or pattern")
     parser.add_argument(
-        "--write",
-        nargs="?",
-        const="",
-        metavar="NAME",
+        "--write", nargs="?", const="", metavar="NAME",
         help="write conf/data/NAME.yaml for data=NAME; by default the name of the first file",
-    )
+    )  # fmt: skip
     parser.add_argument(
         "--plasma", action="store_true",
         help="names such as Te are quantities without a unit, too; what has no unit is in SI",
@@ -70,30 +70,34 @@ def main(arguments: Sequence[str]) -> None:
     given = parser.parse_args(arguments)
     paths = records_of(given.path[0] if len(given.path) == 1 else given.path)
     found = [inspect_file(path, plasma=given.plasma) for path in paths]
+    if axes := axes_of(found[0]):
+        found = [recognise(each.source, given=axes, plasma=given.plasma) for each in found]
     drives = inputs_of(found[0])
     notes = [f"{name} looks set ({how}): an input, if it drives the rest" for name, how in drives]
+    notes += [f"{v.name!r} is {n} if you say so, as the command does" for n, v in axes.items()]
     say("\n".join(found[0].lines([*experiments(found[0]), *notes])) + "\n")
     if len(found) > 1:
         say("\n".join(compare_files(found[0], found[1:])) + "\n")
-    names = [path for path in paths if isinstance(path, str)]
-    pattern = propose_pattern(names) if len(paths) > 1 else None
-    if pattern:
+    if pattern := propose_pattern([path for path in paths if isinstance(path, str)]):
         say("\n".join(point_lines(pattern)))
+    points = point_settings(found, pattern, given.path)
     name = re.sub(r"\W+", "_", given.write or _word_for(found[0].source.path)).strip("_")
-    differing = unlike(found)
+    differing, flat = unlike(found), ["+trajectory.axisymmetric=false"] * ("r" in axes)
     if differing and given.write is not None:
         raise ValueError(f"no mapping is written: {differing}")
     if differing:
         lines, end = [], differing
     elif given.write is None:
-        more = ["data.plasma=true"] if given.plasma else []
         path = _hydra(given.path)
-        lines = commands(found, "recognised", pattern, path=path, more=more, drives=drives)
+        first, is_plasma = as_plasma(found[0], axes)
+        more = [*settings_of(axes, plasma=given.plasma or is_plasma), *flat]
+        found = [first, *found[1:]]
+        lines = commands(found, "recognised", points, path=path, more=more, drives=drives)
         end = f"--write writes this to conf/data/{name}.yaml, for data={name}"
     else:
         file = own_config(name)
         write_text(file, config_text(found, paths))
-        lines, end = commands(found, name, pattern, drives=drives), f"written: {file}"
+        lines, end = commands(found, name, points, more=flat, drives=drives), f"written: {file}"
     header = ["next, for example:"] if lines else []
     say("\n".join([*header, *(f"  {line}" for line in lines), end]))
 
@@ -111,10 +115,23 @@ def point_lines(pattern: FilePattern) -> list[str]:
     ]
 
 
+def point_settings(
+    found: Sequence[Inspection], pattern: FilePattern | None, paths: Sequence[str]
+) -> list[str]:
+    """Settings of files that are operating points: by their names, or by what they state."""
+    if pattern is not None:
+        return [f"points.files={pattern.text}"]
+    names = parameters_stated(found)
+    if not 0 < len(names) <= MOST_STATED:
+        return []
+    stated = ",".join(f"{name}:null" for name in names)
+    return [f"points.files={_hydra(paths)}", f"+parameters={{{stated}}}"]
+
+
 def commands(
     found: Sequence[Inspection],
     group: str,
-    pattern: FilePattern | None,
+    points: Sequence[str] = (),
     *,
     path: str = "",
     more: Sequence[str] = (),
@@ -122,41 +139,77 @@ def commands(
 ) -> list[str]:
     """Commands that can be run with the data; placeholders in capitals are for the user.
 
-    group: name in the data group. pattern: of files that are operating points, which are studied as
-    such where an experiment has all that it needs. path: for the group `recognised`, which
-    names no file, and in which `more` and units are given too. drives: see `inputs_of`.
+    group: name in the data group. points: settings of files that are operating points, which are
+    studied as such where an experiment has all that it needs. path: for the group `recognised`,
+    which names no file, and in which units are given too. more: settings. drives: see `inputs_of`.
     """
-    first = found[0]
-    units = ",".join(f"{name}:UNIT" for name in first.no_unit)
-    step = [STEP] * bool(first.no_time)
-    if group == "recognised":
-        step += [*more, *[f"data.units={{{units}}}"] * bool(units)]
+    first, inputs = found[0], [name for name, _ in drives]
+    units = ",".join(f"{name}:UNIT" for name in first.no_unit if name not in SPACE)
+    asked = [f"data.units={{{units}}}"] * bool(units and group == "recognised")
+    data = [f"data={group}", *[STEP] * bool(first.no_time), *more, *asked]
     lines: list[list[str]] = []
-    if pattern is not None:
-        data = [f"data={group}", f"points.files={pattern.text}", *step]
-        lines = point_commands(first, data, n_enough=len(pattern.names) + 2, n_points=len(found))
+    if points:
+        lines = point_commands(first, [*data, *points], inputs)
     if not lines:
-        data = [f"data={group}", *([f"data.path={path}"] if path else []), *step]
-        inputs = [name for name, _ in drives]
+        data = [*data[:1], *([f"data.path={path}"] if path else []), *data[1:]]
         lines = record_commands(first, data, inputs, are_several=len(found) > 1)
-    if not lines and path:
-        lines = [line] if (line := point_command(first, path)) else []
     return [f"ep2sindy {' '.join(map(shlex.quote, line))}" for line in lines]
 
 
 def point_commands(
-    found: Inspection, data: list[str], *, n_enough: int, n_points: int
+    found: Inspection, data: Sequence[str], inputs: Sequence[str]
 ) -> list[list[str]]:
-    """Commands that study the files as operating points. n_enough: of these, for a prediction."""
-    lines = []
+    """Commands that study the files as operating points: two densities, or else one signal."""
+    given, lines = [*channel(found), *preparation(found)], []
+    if not found.lacking(NEEDS["breathing"]):
+        lines.append(["+exp=breathing", *data, *given])
     if not found.lacking(NEEDS["parametric"]):
-        more = ["thesis=null", *channel(found), *preparation(found)]
-        lines.append(["+exp=parametric", *data, *more])
-    # Laws of degree one must fit, with each point left out in turn.
-    if not found.lacking(NEEDS["predict"]) and n_points >= n_enough:
-        aside = [f"~models.{name}" for name in WITH_INFLOW]
-        lines.append(["+exp=predict", *data, *aside, *channel(found)])
-    return lines
+        lines.append(["+exp=parametric", *data, "thesis=null", *given])
+    signals = signals_of(found, [*NOT_STATES, *inputs])
+    states = ",".join(signals[:1] if "I_d" in signals else signals or found.signals)
+    return lines or [["+exp=predict", *data, f"trajectory.states=[{states}]"]] * bool(states)
+
+
+def signals_of(found: Inspection, inputs: Sequence[str]) -> list[str]:
+    """Signals of time alone that are no inputs, the discharge current first."""
+    return sorted((name for name in found.traces if name not in inputs), key="I_d".__ne__)
+
+
+def axes_of(found: Inspection) -> dict[str, Variable]:
+    """The axes next to time, at most two, that may be z and r: lengths, or x and y without unit."""
+    lengths = {n for one in found.held if len(one.shape) > 1 for n in one.shape}
+    alike = [
+        Variable(one.name, one.unit)
+        for one in found.held
+        if one.step is not None
+        and one.shape[0] in lengths - {found.n_samples}
+        and (converts("z", one.unit) or (not one.unit and last_of(one.name) in ("x", "y")))
+    ]
+    is_free = found.z is None and found.r is None and len(alike) <= len(SPACE)
+    return dict(zip(SPACE, alike, strict=False)) if is_free else {}
+
+
+def as_plasma(found: Inspection, axes: Mapping[str, Variable]) -> tuple[Inspection, bool]:
+    """The file with its names taken for a plasma's, if it then holds both densities, and whether.
+
+    Units that the file does not state are asked for.
+    """
+    needed = NEEDS["breathing"]
+    if not found.lacking(needed):
+        return found, False
+    plasma = recognise(found.source, given=axes, plasma=True)
+    if plasma.lacking(needed):
+        return found, False
+    bare = {one.name for one in plasma.held if one.unit in ("", "1")}
+    places = {**plasma.axes, **plasma.variables}.items()
+    asked = {n: "" for n, v in places if v.name in bare and v.unit != "1"}
+    return replace(plasma, no_unit=asked), True
+
+
+def settings_of(axes: Mapping[str, Variable], *, plasma: bool) -> list[str]:
+    """Settings of the group `recognised` for axes by hand, and for names of a plasma."""
+    of_axes = [f"data.{n}={{name:{v.name},unit:{v.unit or 'UNIT'}}}" for n, v in axes.items()]
+    return [*["data.plasma=true"] * plasma, *of_axes]
 
 
 def inputs_of(found: Inspection) -> list[tuple[str, str]]:
@@ -179,34 +232,17 @@ def record_commands(
     lines = []
     if not found.lacking(NEEDS["breathing"]):
         lines.append(["+exp=breathing", *data, *channel(found), *preparation(found)])
-    traces = [name for name in found.traces if name not in inputs]
-    if traces and not are_several:
-        signal = "I_d" if "I_d" in traces else traces[0]
-        lines.append(["+exp=trace", *data, f"signal={signal}", *given])
+    signals = signals_of(found, inputs)
+    if signals and not are_several:
+        lines.append(["+exp=trace", *data, f"signal={signals[0]}", *given])
     # One state alone cannot oscillate.
-    for names in (traces, ["n_i", "n_n"], found.signals):
+    for names in (found.traces, ["n_i", "n_n"], found.signals):
         states = [n for n in names if n in found.signals and n not in (*NOT_STATES, *inputs)]
         if len(states) > 1 or given:
             break
     if len(states) > 1 or given:
         lines.append(["+exp=discover", *data, f"trajectory.states=[{','.join(states)}]", *given])
     return lines
-
-
-def point_command(found: Inspection, path: str) -> list[str]:
-    """The command that studies a point in the middle of arrays over axes that are not z and r."""
-    time, n = found.time, found.n_samples
-    over = [e for e in found.held if len(e.shape) > 1 and e.shape[0] == n and not e.problem]
-    if time is None or len(over) < 2:
-        return []
-    places = {e.name: ", ".join([":", *(str(n // 2) for n in e.shape[1:])]) for e in over}
-    named = [f'{e.name}:{{name:"{e.name}[{places[e.name]}]",unit:"{e.unit or 1}"}}' for e in over]
-    return [
-        "+exp=discover", "data=file", f"data.path={path}", f"data.time.name={time.name}",
-        f"data.time.unit={time.unit}", "data.z.name=null", "~data.variables",
-        f"+data.variables={{{','.join(named)}}}",
-        f"trajectory.states=[{','.join(each.name for each in over)}]",
-    ]  # fmt: skip
 
 
 def channel(found: Inspection) -> list[str]:

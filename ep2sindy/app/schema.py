@@ -77,7 +77,8 @@ def study_of(study: type, config: DictConfig) -> Any:
             hint = "; a file of conf/thruster begins with the line '# @package data.thruster'"
         near = "".join(near_words(name, known) for name in sorted(unknown))
         raise ValueError(f"unknown keys {sorted(unknown)}{near}; keys are {sorted(known)}{hint}")
-    if isinstance(config.get("points"), str) and OmegaConf.is_missing(config.data, "path"):
+    first = (config.get("points") or [None])[0]
+    if isinstance(first, str) and OmegaConf.is_missing(config.data, "path"):
         config.data.path = None  # the points name the files
     nodes = nodes_of(OmegaConf.to_container(config))
     if unset := [at for at, node in nodes if node == "???" and re.split(r"\W", at)[0] in used]:

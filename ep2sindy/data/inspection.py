@@ -107,8 +107,13 @@ class Inspection:
         return [
             name
             for name, one in self._arrays.items()
-            if one.step is None and one.low < one.high and not is_counter_name(one.name)
+            if one.step is None and name in self.varying and not is_counter_name(one.name)
         ]
+
+    @cached_property
+    def varying(self) -> list[str]:
+        """Variables that do not stay at one value."""
+        return [name for name, one in self._arrays.items() if one.low < one.high]
 
     @property
     def traces(self) -> list[str]:

@@ -49,6 +49,7 @@ def open_field(
     channel_m: float | None = None,
     units: Mapping[str, str] | None = None,
     plasma: bool = False,
+    at: Mapping[str, float] | None = None,
     chunks: Mapping[str, int] | None = None,
 ) -> xr.Dataset:
     """Open a file as a field with the package's names, dimensions and units.
@@ -80,6 +81,8 @@ def open_field(
     plasma : bool, default False
         True if names such as Te mean a plasma's quantities even without a unit, and numbers without
         a unit are in SI. Only without `variables`.
+    at : mapping of str to float, optional
+        Value of each axis of the file besides time, z and r, such as {"V": 300.0}.
     chunks : mapping of str to int, optional
         Length by dimension, to stream data that exceed memory (needs dask).
 
@@ -105,7 +108,7 @@ def open_field(
     >>> field["n_i"].attrs["units"]
     'm^-3'
     """
-    source, problems = open_record(path), Problems()
+    source, problems = open_record(path).at(at or {}), Problems()
     axes: Mapping[str, Variable] = in_file({"time": time, "z": z, "r": r}, problems)
     times: Sequence[Variable] = [axes["time"]] if "time" in axes else []
     if variables is None:

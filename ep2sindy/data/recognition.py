@@ -31,6 +31,7 @@ from ep2sindy.data.quantities import (
     last_of,
     own_unit,
     quantity_of,
+    split_unit,
     step_given_by,
     words_of,
 )
@@ -295,10 +296,18 @@ class _Arrays:
         }
         fit = [each for each in rest if self._fits(each, known, lengths)]
         meant: dict[str, dict[str, str]] = {}  # our name -> names in the file, with their units
+        electrons: dict[str, str] = {}  # which have the density of the ions
         for each in fit:
             unit = "" if each.unit == "1" else each.unit
             if (quantity := quantity_of(each.name, unit, plasma=self.plasma)) is not None:
                 meant.setdefault(quantity[0], {})[each.name] = quantity[1]
+            base, ending = split_unit(last_of(each.name))
+            unit = unit or ending
+            if words_of(base) in ELECTRONS and (converts("n_i", unit) if unit else self.plasma):
+                electrons[each.name] = unit
+        if "n_n" in meant and "n_i" not in meant and len(electrons) == 1:
+            meant = {"n_i": electrons, **meant}
+            self.questions.append(f"{next(iter(electrons))!r} is taken as n_i, by quasi-neutrality")
         found: dict[str, Variable] = {}
         for ours, options in meant.items():
             if len(options) == 1 or ours in options:
@@ -341,7 +350,8 @@ class _Arrays:
             part = ", ".join([":", *["0"] * (len(one.shape) - 1)])
             self.questions.append(
                 f"{one.name!r} of shape {one.shape} has an axis without a coordinate: name it, "
-                f"such as data.z.name=NAME, or take part of the array, such as {one.name}[{part}]"
+                "such as data.z.name=NAME, or points.axes=[NAME] if it is of operating points, or "
+                f"take part of the array, such as {one.name}[{part}]"
             )
         return len(ways) == 1
 
@@ -352,13 +362,6 @@ class _Arrays:
         texts = ", ".join(f"{name!r} for {q[0]}" for name, q in meant.items() if q)
         if texts and not self.plasma and {*found} & {*KNOWN_UNITS}:
             self.questions.append(f"data.plasma=true takes {texts}, and what has no unit for SI")
-        if "n_i" not in found:
-            self.questions.extend(
-                f"in a quasi-neutral plasma {e.name!r} is n_i: say so in the mapping that --write "
-                "makes"
-                for e in rest
-                if words_of(last_of(e.name)) in ELECTRONS
-            )
 
 
 def _step_in_s(times: ArrayInfo, unit: str) -> float:

@@ -9,18 +9,25 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from glob import escape, glob
+from itertools import product
 from pathlib import Path
 
-import numpy as np
 import xarray as xr
 
 from ep2sindy.data.inspection import Inspection
-from ep2sindy.data.numbers import real_numbers
+from ep2sindy.data.mapping import ArrayInfo
 from ep2sindy.data.open import inspect_file, open_field
-from ep2sindy.data.quantities import COUNTERS, is_counter_name, own_unit, to_si
+from ep2sindy.data.quantities import (
+    COUNTERS,
+    NAMED_UNITS,
+    is_counter_name,
+    last_of,
+    own_unit,
+    to_si,
+)
 from ep2sindy.data.readers.source import file_named
-from ep2sindy.data.steps import files_of
-from ep2sindy.data.trajectory import Trajectory
+from ep2sindy.data.steps import files_of, open_record
+from ep2sindy.data.trajectory import ConstantStateError, Trajectory
 from ep2sindy.data.zones import Zone, zone_average
 from ep2sindy.runtime.values import check_list
 
@@ -148,6 +155,8 @@ def _quantity(before: str, after: str, *, taken: Sequence[str]) -> str:
     words = [*([ahead[1]] if ahead else []), *re.findall(rf"^{_LETTERS}", after)]
     if name.endswith("#") or (ahead and not ahead[2] and ahead[1].lower() in LABELS):
         return ""
+    if "=" not in name:  # `tek300V` says a voltage
+        words = sorted(words, key=lambda word: word not in NAMED_UNITS)
     base = next((word for word in words if word.lower() not in LABELS), "")
     free = (f"{base}{k}" if k else base for k in range(len(taken) + 1))
     return next(name for name in free if name not in taken)
@@ -179,7 +188,8 @@ def read_runs(
         Names of the parameters that each file states itself: as a column or variable that is
         constant, or as an attribute.
     states : sequence of str, optional
-        Names of the states. None takes all variables except the parameters and counters.
+        Names of the states. None takes all variables that vary in a file, except the parameters,
+        the inputs and counters.
     inputs : sequence of str, default ()
         Names of the inputs.
     zone : Zone, optional
@@ -197,8 +207,8 @@ def read_runs(
     Raises
     ------
     ValueError
-        If a file is listed twice, a parameter is missing or not constant, a field has no zone, or
-        `open_field` refuses a file. The error names the file.
+        If a file is listed twice, a parameter is missing or not constant, a field has no zone, a
+        state stays constant, or `open_field` refuses a file. The error names the file.
 
     Warns
     -----
@@ -213,83 +223,137 @@ def read_runs(
     """
     for what, names in {"parameters": parameters, "states": states, "inputs": inputs}.items():
         check_list(what, names)
-    units, runs = units or {}, []
-    for file, named in _points_of(files).items():
+    units = units or {}
+    points, others = points_of(files)
+    if others:
+        words = f"left out, for their names hold no number there: {', '.join(others)}"
+        warnings.warn(words, stacklevel=2)
+    opened, varied = [], dict[str, None]()
+    for file, named in points.items():
         with file_named(Path(file)):
             found = inspect_file(file, plasma=plasma)
             aside = {*named, *parameters} - {*found.variables}
             given = {"time": "s"} if dt_s is None and "time" in found.no_unit else {}
             given |= {name: unit for name, unit in units.items() if name not in aside}
             field = open_field(file, units=given, dt_s=dt_s, plasma=plasma)
-            point = {
-                name: _in_si(name, xr.DataArray(named[name]), units)
-                if name in named
-                else _parameter_in(found, field, name, units)
-                for name in (*named, *parameters)
-            }
-            chosen = states
-            if chosen is None:
-                used = {n for n, v in found.variables.items() if {n, v.name} & {*parameters}}
-                varied = (str(n) for n, each in field.data_vars.items() if "time" in each.dims)
-                chosen = [n for n in varied if n not in {*inputs, *used} and not is_counter_name(n)]
-            axes = {axis for n in (*chosen, *inputs) if n in field for axis in field[n].dims}
-            if zone is None and (space := sorted(map(str, axes - {"time"}))):
-                raise ValueError(
-                    f"a field over {' and '.join(space)} needs a zone to be averaged over: give "
-                    "zone=ep.Zone(z=(FROM, TO)) in m, or ep.Zone() for all of it"
-                )
-            run = zone_average(field, zone, states=chosen, inputs=inputs, label=file)
-            values = {name: float(value) for name, value in point.items()}
-            of_point = {name: value.attrs["units"] for name, value in point.items()}
-            runs.append(replace(run, parameters=values, units={**run.units, **of_point}))
+            point = {name: _in_si(name, xr.DataArray(named[name]), units) for name in named}
+            asked = [name for name in parameters if name not in named]
+            point |= parameters_in(found, asked, {**units, **given})
+        used = {n for n, v in found.variables.items() if {n, v.name} & {*point, *inputs}}
+        free = (n for n in found.varying if n not in used and "time" in field[n].dims)
+        varied |= dict.fromkeys(name for name in free if not is_counter_name(name))
+        opened.append((file, field, point))
+    runs = []
+    for file, field, point in opened:
+        chosen = [name for name in varied if name in field] if states is None else states
+        with file_named(Path(file)):
+            run = _average(field, zone, chosen, inputs, file)
+        values = {name: float(value) for name, value in point.items()}
+        of_point = {name: value.attrs["units"] for name, value in point.items()}
+        runs.append(replace(run, parameters=values, units={**run.units, **of_point}))
     return runs
 
 
-def _points_of(files: str | Path | Sequence[str | Path]) -> Mapping[str, Mapping[str, float]]:
-    """The files, each with the parameters that its name says."""
+def _average(
+    field: xr.Dataset, zone: Zone | None, states: Sequence[str], inputs: Sequence[str], file: str
+) -> Trajectory:
+    """The run of a file. Raises ValueError for a field without a zone, and for a steady one."""
+    axes = {axis for n in (*states, *inputs) if n in field for axis in field[n].dims}
+    if zone is None and (space := sorted(map(str, axes - {"time"}))):
+        raise ValueError(
+            f"a field over {' and '.join(space)} needs a zone to be averaged over: give "
+            "zone=ep.Zone(z=(FROM, TO)) in m, or ep.Zone() for all of it"
+        )
+    try:
+        return zone_average(field, zone, states=states, inputs=inputs, label=file)
+    except ConstantStateError as error:
+        raise ConstantStateError(
+            f"{file}: {error}; a steady point is no run: leave the file out, or take +exp=predict, "
+            "which counts it among the points"
+        ) from error
+
+
+def points_of(
+    files: str | Path | Sequence[str | Path],
+) -> tuple[Mapping[str, Mapping[str, float]], Sequence[str]]:
+    """The files, each with the parameters that its name says; and those that nearly fit a pattern.
+
+    Raises ValueError if no file fits, or one is listed twice.
+    """
     if isinstance(files, str | Path) and "{" in str(files):
-        points, others = FilePattern(str(files)).points()
-        if others:
-            words = f"left out, for their names hold no number there: {', '.join(others)}"
-            warnings.warn(words, stacklevel=3)
-        return points
+        return FilePattern(str(files)).points()
     listed = files_of(files)
     places = Counter(Path(file).resolve() for file in listed)
     if twice := [str(place) for place, n in places.items() if n > 1]:
         raise ValueError(f"every file may come once: {twice[0]} comes again; leave one out")
-    return {file: {} for file in listed}
+    return {file: {} for file in listed}, []
 
 
-def _parameter_in(
-    found: Inspection, field: xr.Dataset, name: str, units: Mapping[str, str]
-) -> xr.DataArray:
-    """What a file says of a parameter. Raises ValueError for one that is nowhere, or varies."""
-    source = found.source
-    if name in field:
-        array = field[name]
-    elif name in source.known:
-        array = source.read(name)
-        array.attrs.setdefault("units", source.units.get(name, ""))
-    elif name in source.attributes:
-        array = xr.DataArray(source.attributes[name])
-    else:
-        known = [*source.names, *source.attributes]
-        raise ValueError(
-            f"a parameter must be an attribute, a scalar or a column: {name!r} is none of {known}"
-        )
-    values = real_numbers(array.values, f"parameter {name!r}")
-    values = np.unique(values[np.isfinite(values)])
-    if len(values) != 1:
-        ends = f", from {values[0]:g} to {values[-1]:g}" if len(values) else ""
-        raise ValueError(
-            f"a parameter must be constant: {name!r} has {len(values)} values{ends}; take it as an "
-            "input, or leave it out"
-        )
-    one = xr.DataArray(values[0], attrs=array.attrs)
-    return one if name in field else _in_si(name, one, units)
+def parameters_in(
+    found: Inspection, names: Sequence[str], units: Mapping[str, str]
+) -> dict[str, xr.DataArray]:
+    """Parameters that a file states, in SI: as attributes, scalars or columns that are constant.
+
+    units: by name, where the file states none. The last part of a path, `set/Ud`, is a name, too.
+    Raises ValueError for a parameter that the file lacks, and for one that varies.
+    """
+    held, point = _held_in(found), {}
+    for name in names:
+        places = [v.name for n, v in found.variables.items() if n == name]
+        places += [name, *(n for n in held if last_of(n) == name)]
+        one = next((held[place] for place in places if place in held), None)
+        if one is None:
+            constant = [each.name for each in held.values() if each.low == each.high]
+            raise ValueError(
+                "a parameter must be an attribute, a scalar or a constant column of each file: "
+                f"{name!r} is none of its {constant}"
+            )
+        if one.low < one.high:
+            raise ValueError(
+                f"a parameter must be constant: {name!r} runs from {one.low:g} to {one.high:g}; "
+                "take it as an input, or leave it out"
+            )
+        point[name] = _in_si(name, xr.DataArray(one.low, attrs={"units": one.unit}), units)
+    return point
+
+
+def parameters_stated(files: Sequence[Inspection]) -> list[str]:
+    """Names of what every one of several files states as constant, and not all alike."""
+    points = [
+        {last_of(name): one.low for name, one in _held_in(each).items() if one.low == one.high}
+        for each in files
+    ]
+    shared = [name for name in points[0] if all(name in point for point in points)]
+    differ = [name for name in shared if len({point[name] for point in points}) > 1]
+    return [name for name in differ if name.isidentifier() and not is_counter_name(name)]
+
+
+def _held_in(found: Inspection) -> dict[str, ArrayInfo]:
+    """What a file holds of numbers, attributes among them."""
+    attributes = found.source.attributes.items()
+    numbers = {n: float(v) for n, v in attributes if not isinstance(v, str)}
+    held = {one.name: one for one in found.held if one.low <= one.high}
+    return held | {n: ArrayInfo(n, low=v, high=v) for n, v in numbers.items()}
+
+
+def points_on_axes(
+    path: str | Path, names: Sequence[str], units: Mapping[str, str]
+) -> list[list[dict[str, float]]]:
+    """Every combination of the values of some axes of a file: as the file says them, and in SI.
+
+    Raises ValueError for a name that is no vector of the file.
+    """
+    source = open_record(path)
+    own = {name: source.axis(name) for name in names}
+    in_si = {name: _in_si(name, points, units) for name, points in own.items()}
+    return [
+        [{n: float(v[at[n]]) for n, v in axes.items()} for axes in (own, in_si)]
+        for ks in product(*(range(points.size) for points in own.values()))
+        for at in [dict(zip(names, ks, strict=True))]
+    ]
 
 
 def _in_si(name: str, value: xr.DataArray, units: Mapping[str, str]) -> xr.DataArray:
-    """A value in SI, or in the unit of its name's suffix, by the unit given here or in the file."""
+    """Values in SI, or in the unit of their name's suffix, by the unit given or the file's."""
     unit = units.get(name) or own_unit(name, str(value.attrs.get("units", "")))
     return to_si(value, name, unit, is_variable=True)

@@ -157,10 +157,9 @@ class Study:
             report.say(f"left out, for their names hold no number: {', '.join(given.left_out)}")
         inputs = self.source.inputs(self._libraries.values())
         for point in count_pieces(report.watch, given.sources, "operating point"):
-            sampling = point.source.trajectory
             try:
                 field = point.source.field()
-                data = sampling.trajectory(field, inputs=inputs, label=point.label)
+                data = point.run(field, inputs)
             except (ConstantStateError, DivergedError) as error:
                 report.warn(f"{point.label} is left out: {error}")
                 continue

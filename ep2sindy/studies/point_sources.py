@@ -6,10 +6,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
+from pathlib import Path
 from typing import Annotated, Any
 
+import xarray as xr
+
+from ep2sindy.data.open import inspect_file
 from ep2sindy.data.quantities import STEP_DOUBT
-from ep2sindy.data.run_files import FilePattern
+from ep2sindy.data.readers.source import file_named
+from ep2sindy.data.run_files import parameters_in, points_of, points_on_axes
 from ep2sindy.data.trajectory import ConstantStateError, Trajectory, point_label
 from ep2sindy.operating.records import Point, name_point
 from ep2sindy.report.report import Report
@@ -24,11 +29,11 @@ WITHOUT_BREATHING = (  # attributes of a simulation
 )  # fmt: skip
 
 Points = Annotated[
-    Sequence[Mapping[str, Any]] | str,
+    Sequence[Mapping[str, Any] | str] | str,
     Check(
-        "a list like [{V_D_V: [250,300], mdot_mg_s: [4,5]}], or a pattern of files, "
-        "'points.files=runs/V{V_D_V}_m{mdot_mg_s}.csv'",
-        lambda value: isinstance(value, list | str) and bool(value),
+        "a list like [{V_D_V: [250,300], mdot_mg_s: [4,5]}]; files, by a pattern, "
+        "'points.files=runs/V{V_D_V}_m{mdot_mg_s}.csv', or a list; or points.axes=[V] of one file",
+        lambda value: isinstance(value, list | str) and len({*map(type, value)}) == 1,
     ),
 ]
 Functions = Annotated[
@@ -54,27 +59,60 @@ class GivenPoints:
 
 
 def given_points(
-    points: Sequence[Mapping[str, Any]] | str, parameters: Mapping[str, str | None], source: Source
+    points: Sequence[Mapping[str, Any] | str] | str,
+    parameters: Mapping[str, str | None],
+    source: Source,
 ) -> GivenPoints:
-    """Operating points of a config: a list, or the files of a pattern, which names the parameters.
+    """Operating points of a config: a list, files by a pattern or a list, or axes of one file.
 
-    parameters: the place of each in the data group; None if it has none.
-    Raises ValueError for a pattern next to data that are not read from files, or that no file fits.
+    parameters: the place of each in the data group. Those without one, None, are looked up in the
+    files, unless the braces of a pattern name them.
+    Raises ValueError for files or axes next to data that are not read from files, if no file fits,
+    and for a parameter that a file does not state.
     """
-    if not isinstance(points, str):
-        names = list(parameters)
-        return GivenPoints(names, point_sources(source, parameters, expand(points, names)))
-    if "path" not in source.data.settings:
+    names, settings = list(parameters), source.data.settings
+    blocks = [each for each in points if isinstance(each, Mapping)]
+    axes = blocks[0].get("axes", []) if blocks else []
+    if blocks and not axes:
+        return GivenPoints(names, point_sources(source, parameters, expand(blocks, names)))
+    if "path" not in settings:
         raise ValueError(
-            "points of files need data that are read from files: "
-            f"got {source.data.settings['_target_']} with {points!r}; add data=recognised, or "
-            "data=NAME for a config that ep2sindy inspect --write made of them"
+            f"points of files need data that are read from files: got {settings['_target_']} with "
+            f"{points!r}; add data=recognised, or data=NAME for a config that ep2sindy inspect "
+            "--write made of them"
         )
-    pattern = FilePattern(points)
-    found, others = pattern.points()
-    given = [{**values, "data": {"path": file}} for file, values in found.items()]
-    sources = point_sources(source, dict.fromkeys(pattern.names), given)
-    return GivenPoints(list(pattern.names), sources, others)
+    if axes:
+        found = points_on_axes(settings["path"], axes, settings.get("units") or {})
+        given = [{**point, "data": {"at": at}} for at, point in found]
+        return GivenPoints(axes, point_sources(source, dict.fromkeys(axes), given))
+    files = points if isinstance(points, str) else [each for each in points if type(each) is str]
+    asked = [name for name, place in parameters.items() if place is None]
+    given, left_out = _of_files(files, asked, settings)
+    names = [name for name in given[0] if name != "data"]
+    return GivenPoints(names, point_sources(source, dict.fromkeys(names), given), left_out)
+
+
+def _of_files(
+    files: Sequence[str] | str, asked: Sequence[str], settings: Mapping[str, Any]
+) -> tuple[list[dict[str, Any]], Sequence[str]]:
+    """The points of files by their names, and by what is asked of the files; those left out."""
+    found, left_out = points_of(files)
+    names = list(dict.fromkeys([*next(iter(found.values())), *asked]))
+    if not names:
+        raise ValueError(
+            "files of operating points need parameters: a name in braces for a number in their "
+            "names, 'points.files=runs/V{V}.csv', or '+parameters={V: null}' for what the files "
+            f"state, got {files!r}"
+        )
+    given, units = [], settings.get("units") or {}
+    for file, named in found.items():
+        point: dict[str, Any] = {**named, "data": {"path": file}}
+        if missing := [name for name in names if name not in named]:
+            with file_named(Path(file)):
+                inside = inspect_file(file, plasma=bool(settings.get("plasma")))
+                point |= {n: v.item() for n, v in parameters_in(inside, missing, units).items()}
+        given.append(point)
+    return sorted(given, key=lambda each: [each[name] for name in names]), left_out
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +126,11 @@ class PointSource:
     def label(self) -> str:
         return point_label(self.parameters)
 
+    def run(self, field: xr.Dataset, inputs: Sequence[str]) -> Trajectory:
+        """The run of the point's field, which carries the point."""
+        run = self.source.trajectory.trajectory(field, inputs=inputs, label=self.label)
+        return replace(run, parameters=self.parameters)
+
     def open(self, inputs: Sequence[str]) -> OpenedPoint:
         """Open or simulate the point; one that does not oscillate comes without a run.
 
@@ -99,12 +142,10 @@ class PointSource:
                 field = self.source.field()
                 if (status := field.attrs.get("status")) in WITHOUT_BREATHING:
                     return replace(opened, status=status)
-                sampling = self.source.trajectory
-                run = sampling.trajectory(field, inputs=inputs, label=self.label)
-                run = replace(run, parameters=self.parameters)
+                run = self.run(field, inputs)
                 doubts = [field.attrs[STEP_DOUBT]] if STEP_DOUBT in field.attrs else []
                 notes = amiss(field.attrs) if is_simulation(field.attrs) else doubts
-                words = [field.attrs.get("file", ""), sampling.place(field)]
+                words = [field.attrs.get("file", ""), self.source.trajectory.place(field)]
                 used = "; ".join(word for word in words if word)
                 return replace(opened, run=run, notes=notes, used=used)
             except DivergedError:
@@ -205,11 +246,11 @@ def nothing_moves(statuses: Sequence[str]) -> str:
 
 
 def _parameters(given: Mapping[str, Any], names: Sequence[str]) -> dict[str, float]:
-    if set(given) - {"data"} != set(names) or not isinstance(given.get("data", {}), Mapping):
-        raise ValueError(f"a point must have {names}, and data where they differ: got {given!r}")
-    for name in names:
-        if type(given[name]) not in (int, float):
-            raise ValueError(f"points must give {name} as a number: got {given[name]!r}")
+    are_numbers = all(type(given.get(name)) in (int, float) for name in names)
+    if {*given} - {"data"} != {*names} or not are_numbers:
+        raise ValueError(
+            f"a point must have numbers for {names}, and data where they differ: got {given!r}"
+        )
     return {name: float(given[name]) for name in names}
 
 

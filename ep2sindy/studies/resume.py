@@ -67,7 +67,7 @@ def _files_named(settings: object) -> Iterator[str]:
             continue
         if "{" in text and not key:
             yield from FilePattern(text).points()[0]
-        elif key == "path" and any(sign in text for sign in "*?["):
+        elif key in ("path", "") and any(sign in text for sign in "*?["):
             yield from files_of(text)
         else:
             yield text

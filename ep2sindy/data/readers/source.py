@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
@@ -64,6 +64,37 @@ class FileSource:
     def known(self) -> frozenset[str]:
         """All names that can be read, aliases included."""
         return frozenset([*self.names, *self.aliases])
+
+    def axis(self, name: str) -> xr.DataArray:
+        """The coordinate of an axis. Raises ValueError for a name that is no vector."""
+        vectors = [each for each in self.names if self.read(each).ndim == 1]
+        if name not in vectors:
+            raise ValueError(f"an axis of {self.path} must be one of {vectors}, got {name!r}")
+        return self.read(name)
+
+    def at(self, point: Mapping[str, float]) -> FileSource:
+        """The same file at one value of each of some axes, by their names.
+
+        If the file does not name the dimensions of its arrays, an axis is found by its length.
+        Raises ValueError for a value that the axis has not.
+        """
+        source = self
+        for axis, value in point.items():
+            points = self.axis(axis)
+            if value not in points.values:
+                raise ValueError(f"{axis} must be one of {points.values.tolist()}, got {value!r}")
+            place = int(np.flatnonzero(points.values == value)[0])
+            source = replace(source, read=partial(source._read_at, points, place))
+        return source
+
+    def _read_at(self, points: xr.DataArray, place: int, name: str) -> xr.DataArray:
+        array = self.read(name)
+        alike = [dim for dim, n in array.sizes.items() if array.ndim > 1 and n == points.size]
+        own = [dim for dim in array.dims if dim in points.dims] if self.dims_named else alike
+        if len(own) > 1:
+            sizes = f"{name!r} has shape {array.shape} and dimensions without names"
+            raise ValueError(f"an axis of points must differ in length from others: {sizes}")
+        return array.isel(dict.fromkeys(own, place))
 
 
 @dataclass(frozen=True)
