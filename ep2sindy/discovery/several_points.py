@@ -33,8 +33,8 @@ from ep2sindy.operating.left_out import (
     LawTrial,
     choose_law,
     follow_together,
+    leave_out,
     run_quiet,
-    test_trials,
 )
 from ep2sindy.operating.point_fits import PointFits, fit_rows, fit_trajectories
 from ep2sindy.operating.quiet import QuietPoint, quiet_points
@@ -78,7 +78,8 @@ class LawSearch:
     windows : RefinementSettings, optional
         Windows of trajectories on which the coefficients of every point are refined. None takes 20
         of two periods after a `TrajectorySearch`, or ten of eight if one state was made of another,
-        as by `ep.embed`; after a `Regression` the coefficients stay those of its rows.
+        as by `ep.embed`; under a rule that runs models, of as many periods as this takes. After any
+        other `Regression` the coefficients stay those of its rows.
 
     Examples
     --------
@@ -137,10 +138,11 @@ class PointsProblem:
         """Windows of the refinements; None leaves the coefficients as the rows gave them."""
         if self.law is not None and self.law.windows is not None:
             return self.law.windows
+        rule = self.regression.selection
+        if isinstance(rule, FreeRunScore):  # which refines what it finds at one point, too
+            return replace(WINDOWS, periods=rule.window_periods)
         if not isinstance(self.method, TrajectorySearch):
             return None
-        if isinstance(self.regression.selection, FreeRunScore):
-            return replace(WINDOWS, periods=self.regression.selection.window_periods)
         return LONG_WINDOWS if self.asked.made else WINDOWS
 
     @cached_property
@@ -152,33 +154,46 @@ class PointsProblem:
         return found if loud and all(OperatingRecord(runs[0]).repeats for runs in loud) else []
 
     @cached_property
-    def on_other_cycle(self) -> list[str]:
-        """Labels of points whose records are on another cycle than most, if two coexist."""
-        if self.law is None:
-            return []
+    def _branches(self) -> dict[str, int]:
+        """Number of the cycle of every record that repeats one: 0 on the stronger, or only, one."""
         quiet = {point_label(point.parameters) for point in self.quiet}
-        known = {k: r for k, runs in self.given.items() if (r := OperatingRecord(runs[0])).repeats}
-        loud = {label: record for label, record in known.items() if label not in quiet}
-        if len(loud) < 2:
-            return []
-        numbers = branches_of(list(loud.values()))
-        main = int(2 * numbers.sum() > len(numbers))
-        return [label for label, number in zip(loud, numbers, strict=True) if number != main]
+        records = {k: OperatingRecord(runs[0]) for k, runs in self.given.items() if k not in quiet}
+        loud = {label: record for label, record in records.items() if record.repeats}
+        if self.law is None or not loud:
+            return {}
+        return dict(zip(loud, branches_of(list(loud.values())).tolist(), strict=True))
+
+    @property
+    def _main(self) -> int:
+        """The cycle that most records are on."""
+        return int(2 * sum(self._branches.values()) > len(self._branches))
+
+    @property
+    def cycle(self) -> str:
+        """Name of the cycle of the law: "all" if there is only one, else "strong" or "weak"."""
+        return ("strong", "weak")[self._main] if any(self._branches.values()) else "all"
 
     @cached_property
     def points(self) -> dict[str, Sequence[Trajectory]]:
-        """The runs of every point that is fitted."""
-        aside = {point_label(point.parameters) for point in self.quiet} | {*self.on_other_cycle}
-        return {label: runs for label, runs in self.given.items() if label not in aside}
+        """The runs of every point that is fitted: neither quiet nor on another cycle than most."""
+        quiet = {point_label(point.parameters) for point in self.quiet}
+        main = {label: self._branches.get(label, self._main) for label in self.given}
+        return {
+            label: runs
+            for label, runs in self.given.items()
+            if label not in quiet and main[label] == self._main
+        }
 
     @property
     def notes(self) -> tuple[str, ...]:
         """What is said of points that are not fitted."""
-        if not self.on_other_cycle:
+        others = [label for label, number in self._branches.items() if number != self._main]
+        if not others:
             return ()
-        n, others = len(self.points), ", ".join(self.on_other_cycle)
-        words = f"two cycles coexist: the law is that of {n} points; on the other cycle are {others}"
-        return (words,)
+        return (
+            f"two cycles coexist: the law is that of the {len(self.points)} points on the "
+            f"{self.cycle} one; on the other are {', '.join(others)}",
+        )
 
     @property
     def roles(self) -> Roles | None:
@@ -218,7 +233,8 @@ class PointsProblem:
                 records=same_point,
             )
         if found is not None:
-            found = replace(found, quiet=run_quiet(found.law, self.quiet, self.given))
+            quiet = run_quiet(found.law, self.quiet, self.given)
+            found = replace(found, quiet=quiet, cycle=self.cycle)
         joined = join_points(points, self.values, found)
         return replace(joined, data_warnings=(*joined.data_warnings, *self.notes))
 
@@ -378,12 +394,10 @@ class _Search:
             stage = self.progress.stage(len(refined), "structure", "laws over all points")
             trials = [trial for trial in trials if not trial.fits.statuses]
             trials += chain(*collect(one.workers, follow, refined, stage))
-        tested = test_trials(trials, workers=one.workers, progress=self.progress)
+        tested = leave_out(trials, workers=one.workers, progress=self.progress)
         return choose_law([*known, *tested])
 
 
-def _try_systems(
-    piece: tuple[Systems, Sequence[Trajectory]], *, rule: FreeRunScore
-) -> list[Trial]:
+def _try_systems(piece: tuple[Systems, Sequence[Trajectory]], *, rule: FreeRunScore) -> list[Trial]:
     systems, runs = piece
     return rule.trials(systems, runs)

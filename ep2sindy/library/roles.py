@@ -163,7 +163,7 @@ class Roles:
 
     @property
     def by_point(self) -> dict[str, Mapping[str, float]]:
-        """Inflows that are sums of functions of the operating point: state -> function -> factor."""
+        """Inflows by functions of the operating point: state -> function -> factor."""
         return {state: how for state, how in self.inflow.items() if isinstance(how, Mapping)}
 
     @property

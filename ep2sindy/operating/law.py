@@ -418,8 +418,8 @@ class LawConstraint:
                     "known coefficients must be finite and not zero at every operating point, got "
                     f"{values.tolist()} at {where}; leave the term or the point out"
                 )
-        names, g = self.functions.names, self.functions.evaluate(points)
-        inflow = {s: g[:, list(map(names.index, f))] @ [*f.values()] for s, f in self.inflow.items()}
+        g = dict(zip(self.functions.names, self.functions.evaluate(points).T, strict=True))
+        inflow = {s: sum(v * g[name] for name, v in f.items()) for s, f in self.inflow.items()}
         return [
             replace(
                 self.common,
@@ -521,7 +521,8 @@ def constrain_roles(
         functions = functions + functions_of_point(parameters, f"{state} in", factors)
 
     def held(inflow: Mapping[str, float]) -> Constraint:
-        own = replace(roles, inflow={**roles.inflow, **dict.fromkeys(roles.by_point, 0.0), **inflow})
+        numbers = {**roles.inflow, **dict.fromkeys(roles.by_point, 0.0), **inflow}
+        own = replace(roles, inflow=numbers)
         found = constraint_of(library, states, processes, own.known_processes)
         if found is None:
             raise ValueError(f"the coefficients do not tell these roles apart: {roles}")

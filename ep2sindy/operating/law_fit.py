@@ -120,6 +120,6 @@ def _linearise(
     basis, _ = np.linalg.qr(moves[known])
     rows = (rows - basis @ (basis.transpose(0, 2, 1) @ rows)).reshape(-1, len(z) + 1)
     loss = float(np.square(rows[:, -1]).mean())
-    triangle: np.ndarray = np.linalg.qr(rows / np.sqrt(len(rows)), mode="r")
+    _, triangle = np.linalg.qr(rows / np.sqrt(len(rows)))
     share = float(known.mean())
     return triangle[: len(z), :-1], triangle[: len(z), -1], share * loss + (1.0 - share) * LOST

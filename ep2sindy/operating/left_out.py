@@ -47,8 +47,8 @@ class LeftOutRun:
     """A free run of one point with the law fitted to the other points.
 
     The run starts at one sample of the point's record. inside: True if the other points enclose
-    this one. interpolated: its errors of `Interpolation`, or NaN where the others do not enclose it,
-    or do not repeat cycles.
+    this one. interpolated: its errors of `Interpolation`, or NaN where the others do not enclose
+    it, or do not repeat cycles.
     """
 
     record: OperatingRecord
@@ -140,7 +140,7 @@ def follow_together(
     return trials
 
 
-def test_trials(
+def leave_out(
     trials: Sequence[LawTrial],
     *,
     periods: float = 1.0,
@@ -226,7 +226,8 @@ def run_quiet(law: OperatingLaw, points: Sequence[QuietPoint], runs: Runs) -> li
             t = np.linspace(0.0, max(run.t[-1] - run.t[0], LONG * point.period_s), N_SAMPLES)
             model = read_law(law, point.parameters)
             end = np.nanmean(run.columns(model.states)[-N_LAST:], axis=0)
-            path = simulate(model, t, end, None, blow_up=1e3, reach=np.abs(end) + point.scale).states
+            reach = np.abs(end) + point.scale
+            path = simulate(model, t, end, None, blow_up=1e3, reach=reach).states
             late = path[N_SAMPLES // 2 :]
             rests = np.isfinite(late).all() and (late.std(axis=0) < SMALL * point.scale).all()
             found.append(QuietRun(run, bool(rests)))
@@ -287,20 +288,23 @@ class LawChoice:
             return ""
         n, n_held = len(self.inside), sum(run.run.holds for run in self.inside)
         where = "points left out" if self.inside[0].inside else "points beyond the others"
-        if self.is_trusted or not isfinite(self.statistics["f_interpolated"]):
-            return f"its law holds at {n_held} of {n} {where}"
-        return "interpolate between the records"
+        if self.is_trusted:
+            return f"it holds at {n_held} of {n} {where}"
+        if self.interpolation is None or not self.inside[0].inside:
+            return f"no law holds at {where}: {n_held} of {n}"
+        return f"interpolate: the law holds at {n_held} of {n} {where}"
 
     @property
     def text(self) -> str:
         """How the law does at the points left out, and next to it interpolation."""
+        once = "Left out one at a time, "
         if not self.runs:
-            return f"Left out one at a time, {self._windows_text}." if len(self.choice.errors) else ""
+            return f"{once}{self._windows_text}." if len(self.choice.errors) else ""
         found, n, n_held = self.statistics, len(self.inside), sum(r.run.holds for r in self.inside)
-        where = "that the others enclose " if self.inside[0].inside else ""
-        said = f"Left out one at a time, the law of the others holds at {n_held} of {n} points {where}"
+        where = " that the others enclose" if self.inside[0].inside else ""
+        said = f"{once}the law of the others holds at {n_held} of {n} points{where}"
         if isfinite(found["f_enclosed"]):
-            said += f"and errs there by {_percent(found, 'enclosed')} in the median"
+            said += f" and errs there by {_percent(found, 'enclosed')} in the median"
         said = f"{said}; {self._windows_text}. "
         if not isfinite(found["f_interpolated"]):
             return f"{said}No point is enclosed by others whose records repeat cycles."
@@ -321,7 +325,7 @@ def choose_law(trials: Sequence[LawTrial]) -> LawChoice:
     Laws that hold at the records that they were fitted to come before others. Of models that run
     freely, it is the best of those that hold or attract at more than half of the points left out,
     if there are any: a neutral cycle keeps the amplitude of its start.
-    trials: as `test_trials` returns them; without errors the last one is taken.
+    trials: as `leave_out` returns them; without errors the last one is taken.
     """
     tested, first = [trial for trial in trials if len(trial.errors)], None
     left = [trial for trial in tested if trial.holds] or tested

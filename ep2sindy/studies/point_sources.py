@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
@@ -19,14 +19,13 @@ from ep2sindy.data.trajectory import ConstantStateError, Trajectory, point_label
 from ep2sindy.operating.records import Point, name_point
 from ep2sindy.report.report import Report
 from ep2sindy.runtime.parallel import Workers, collect
-from ep2sindy.signals.spectrum import Oscillation
-from ep2sindy.studies.source import DivergedError, Source, amiss, is_simulation, quiet
+from ep2sindy.signals.spectrum import Oscillation, oscillation
+from ep2sindy.studies.processes import NO_ZONES, Zones
+from ep2sindy.studies.source import DivergedError, Source, amiss, is_simulation, quiet, zones_in
 from ep2sindy.studies.study import Check, Deferred
 
-WITHOUT_BREATHING = (  # attributes of a simulation
-    Oscillation.STEADY, Oscillation.DECAYING, Oscillation.TRANSIT, Oscillation.DIVERGED,
-    Oscillation.OUT,
-)  # fmt: skip
+# Statuses of a simulation whose record tells nothing of a law: neither a cycle nor a rest.
+USELESS = (Oscillation.TRANSIT, Oscillation.DIVERGED, Oscillation.OUT)
 
 Points = Annotated[
     Sequence[Mapping[str, Any] | str] | str,
@@ -132,7 +131,7 @@ class PointSource:
         return replace(run, parameters=self.parameters)
 
     def open(self, inputs: Sequence[str]) -> OpenedPoint:
-        """Open or simulate the point; one that does not oscillate comes without a run.
+        """Open or simulate the point; one whose record tells nothing comes without a run.
 
         A state that stays exactly constant makes a point steady, as no trajectory may hold it.
         """
@@ -140,33 +139,41 @@ class PointSource:
         with name_point(self.parameters):
             try:
                 field = self.source.field()
-                if (status := field.attrs.get("status")) in WITHOUT_BREATHING:
-                    return replace(opened, status=status)
+                if (status := field.attrs.get("status")) in USELESS:
+                    return replace(opened, given=status)
                 run = self.run(field, inputs)
                 doubts = [field.attrs[STEP_DOUBT]] if STEP_DOUBT in field.attrs else []
                 notes = amiss(field.attrs) if is_simulation(field.attrs) else doubts
                 words = [field.attrs.get("file", ""), self.source.trajectory.place(field)]
                 used = "; ".join(word for word in words if word)
-                return replace(opened, run=run, notes=notes, used=used)
+                zones, _ = zones_in(self.source, field)
+                return replace(opened, run=run, notes=notes, used=used, zones=zones)
             except DivergedError:
-                return replace(opened, status=Oscillation.DIVERGED)
+                return replace(opened, given=Oscillation.DIVERGED)
             except ConstantStateError:
-                return replace(opened, status=Oscillation.STEADY)
+                return replace(opened, given=Oscillation.STEADY)
 
 
 @dataclass(frozen=True, eq=False)
 class OpenedPoint:
     """One operating point, and the run that was recorded there.
 
-    run: None if the source says that nothing oscillates. status: as the source says. notes:
-    data-quality warnings on problems of the data. used: description of the data.
+    run: None if the record tells nothing of a law. given: what the source says of such a record.
+    notes: data-quality warnings on problems of the data. used: description of the data. zones: of
+    the run, with their recorded balances.
     """
 
     parameters: Point
     run: Trajectory | None = None
-    status: str = Oscillation.OSCILLATING
+    given: str = Oscillation.OSCILLATING
     notes: Sequence[str] = ()
     used: str = ""
+    zones: Zones = NO_ZONES
+
+    @cached_property
+    def status(self) -> str:
+        """Whether the record oscillates; else what it, or its source, says."""
+        return self.given if self.run is None else oscillation(self.run.t, self.run.states)
 
     @property
     def label(self) -> str:

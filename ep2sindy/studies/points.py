@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 import pandas as pd
+from jaxtyping import Float
 
+from ep2sindy.data.numbers import least_squares
 from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.method import Regression
 from ep2sindy.discovery.result import Discovery
@@ -19,18 +21,19 @@ from ep2sindy.library.facts import Known
 from ep2sindy.library.library import Library, named_terms, polynomial
 from ep2sindy.library.relations import constraint
 from ep2sindy.library.roles import Roles
-from ep2sindy.operating.law import LawFunctions, make_basis
-from ep2sindy.operating.left_out import LawChoice, choose_law
-from ep2sindy.operating.map import law_map, map_points
+from ep2sindy.operating.law import LawFunctions, constrain_law, make_basis, read_law
+from ep2sindy.operating.left_out import LawChoice, LawTrial, choose_law
+from ep2sindy.operating.map import MapPoint, law_map, map_points
 from ep2sindy.operating.quantities import Quantity
-from ep2sindy.operating.records import OperatingRecord, read_points
+from ep2sindy.operating.records import Point, read_points
 from ep2sindy.refinement.problem import RefinementSettings
 from ep2sindy.regression.rows import Formulation
+from ep2sindy.report.document import Text
 from ep2sindy.report.report import Report
 from ep2sindy.runtime.parallel import Workers, collect
 from ep2sindy.signals.embedding import Embedded, embed_alike
 from ep2sindy.signals.signal import prepare_signal
-from ep2sindy.signals.spectrum import Oscillation, oscillation
+from ep2sindy.signals.spectrum import Oscillation
 from ep2sindy.studies.point_sources import (
     Functions,
     GivenPoints,
@@ -49,12 +52,14 @@ from ep2sindy.studies.point_tables import (
     points_table,
     read_published,
 )
-from ep2sindy.studies.processes import inflow_of_points
+from ep2sindy.studies.processes import fit_roles
 from ep2sindy.studies.resume import resumed
 from ep2sindy.studies.source import Source
 from ep2sindy.studies.structures import Terms, terms_of
 from ep2sindy.studies.study import Count, Positive
 from ep2sindy.studies.sustained import SustainedSearch
+
+EXACT = 1e-3  # part of a known value that may be left, as where a record's balance is averaged
 
 N_TOGETHER = 24  # points of a map computed as one piece: the records are sent with each piece
 
@@ -149,28 +154,31 @@ class Study:
             if self._is_signal:
                 opened, signal = embed_points(opened)
             runs = [point.run for point in opened if point.run is not None]
-            statuses = [_status(point) for point in opened]
+            statuses = [point.status for point in opened]
             if Oscillation.OSCILLATING not in statuses:
                 if self._has_quantities:
-                    report.table("points", points_table(opened, statuses, None))
+                    report.table("points", points_table(opened))
                     return
                 raise ValueError(nothing_moves(statuses))
-            libraries = self._libraries or {FOUND: self._library(opened, signal, report)}
+            libraries = self._libraries or {"": self._library(opened, signal, report)}
             by_model = {
                 name: self._discover(runs, library, workers, report)
                 for name, library in libraries.items()
             }
-            choice = _best_law(by_model)
-            maps = self._map(choice, opened, workers, report)
-        found = PointsFound(by_model, choice, opened, statuses, maps)
+            found = self._join(by_model, opened)
+            if found.choice is not None:
+                maps = self._map(found.choice, opened, workers, report)
+                found = replace(found, maps=maps)
         self._report(found, report)
 
     def _discover(
         self, runs: Sequence[Any], library: Library, workers: Workers, report: Report
     ) -> Discovery:
         """What the door finds; where points do not suffice for the law, with constants alone."""
-        windows = self.windows and RefinementSettings(self.windows.n_windows,
-                                                      periods=self.windows.periods)  # fmt: skip
+        windows = None
+        if self.windows is not None:
+            n, periods = self.windows.n_windows, self.windows.periods
+            windows = RefinementSettings(n_windows=n, periods=periods)
         search = LawSearch(self._functions, windows)
         method = None
         if library.facts.roles is not None and self.sustained is not None:
@@ -180,16 +188,40 @@ class Study:
             )
         elif self.models:
             method = Regression(self.formulation)
-        find = dict(seed=report.seed, workers=workers, progress=report.watch)
+        find = partial(
+            discover, runs, library, method, seed=report.seed, workers=workers,
+            progress=report.watch,
+        )  # fmt: skip
         try:
-            return discover(runs, library, method, law=search, **find)
+            found = find(law=search)
         except ValueError as error:
             if not self._has_quantities:
                 raise
             report.warn(f"no law of whole models: {error}")
             constants = replace(search, functions=named_terms(self._given.names, ["1"]))
-            found = discover(runs, library, method, law=constants, **find)
-            return replace(found, law=None)
+            found = replace(find(law=constants), law=None)
+        for warning in found.data_warnings:
+            report.warn(warning)
+        return found
+
+    def _join(
+        self, by_model: Mapping[str, Discovery], opened: Sequence[OpenedPoint]
+    ) -> PointsFound:
+        """What was found for every model, and the best of all their laws."""
+        first, trials = next(iter(by_model.values())), list[LawTrial]()
+        for name, own in by_model.items():
+            assert own.law_choice is not None
+            trials += [
+                replace(trial, name=trial.name.replace(f"{FOUND}_1", name) if name else trial.name)
+                for trial in own.law_choice.trials
+            ]
+        choice = None if first.law is None else first.law_choice
+        if choice is not None and len(by_model) > 1:
+            choice = replace(choose_law(trials), quiet=choice.quiet, cycle=choice.cycle)
+        elif choice is not None:
+            taken = trials[[t is choice.choice for t in choice.trials].index(True)]
+            choice = replace(choice, trials=trials, choice=taken)
+        return PointsFound(trials, choice, first, opened)
 
     def _library(
         self, opened: Sequence[OpenedPoint], signal: Embedded | None, report: Report
@@ -206,23 +238,140 @@ class Study:
 
     def _known(self, roles: Roles, opened: Sequence[OpenedPoint], report: Report) -> Roles:
         """The roles with what is supplied at each point, by functions of it; else free."""
-        inflow, words = inflow_of_points(roles, opened)
-        report.say(words)
-        return replace(roles, inflow=inflow)
+        known = [(p.parameters, fit_roles(p.zones.balances, p.run)) for p in opened if p.run]
+        inflow = dict(roles.inflow)
+        for state in roles.inflow:
+            name = f"{state} in"
+            if name in roles.open and all(name in rates for _, rates in known):
+                values = np.array([rates[name].terms["1"] for _, rates in known])
+                inflow[state] = functions_through(values, [point for point, _ in known])
+                words = " + ".join(f"{v:.4g} {f}" for f, v in inflow[state].items())
+                report.say(f"inflow of {state}, by the records' balances: {words}")
+        return replace(roles, inflow=inflow).with_known({})
 
     def _map(
         self, choice: LawChoice, opened: Sequence[OpenedPoint], workers: Workers, report: Report
-    ) -> Sequence[Any]:
+    ) -> list[MapPoint]:
         """The law's models at all points, and then over a grid that encloses these."""
-        if choice.law.model_has_inputs or not any(r.repeats for r in choice.records):
+        records = [record for record in choice.records if record.repeats]
+        if not choice.runs or not records:
             return []
         points = [point.parameters for point in opened]
         at = [*points, *(map_points(points, self.map_points) if self.map_points else [])]
         pieces = [at[first : first + N_TOGETHER] for first in range(0, len(at), N_TOGETHER)]
         stage = report.watch.stage(len(at), "point", "map of the law")
-        records = [record for record in choice.records if record.repeats]
         one = partial(law_map, choice.law, records)
         return [p for piece in collect(workers, one, pieces, stage, size=len) for p in piece]
 
     def _report(self, found: PointsFound, report: Report) -> None:
-        """Fill the report: quantities, law, points, models."""
+        """Fill the report: quantities, law, processes, points, models."""
+        opened, choice, shown = found.opened, found.choice, None
+        n_oscillating = sum(point.status == Oscillation.OSCILLATING for point in opened)
+        report.headline |= {"n_points": len(opened), "n_oscillating": n_oscillating}
+        report.table("fits", fits_table(found), shown=False)
+        if self._has_quantities:
+            quantities = {name: own.quantities for name, own in (self.models or {}).items()}
+            shown = add_quantities(report, found, quantities, self._published, self.labels)
+        points = points_table(opened, found)
+        if choice is not None:
+            others = "other models or models=null" if self.models else "another ++degree=..."
+            of_law = add_law(report, found, points, self.labels, others)
+            more = [Text(choice.text)] if choice.text else []
+            shown = replace(shown, blocks=[*shown.blocks, *more]) if shown else of_law
+        assert shown is not None
+        report.found(shown)
+        report.section("Operating points", "Units are SI, unless a name ends in another.")
+        report.table("points", points)
+        numbers = {point.label: k for k, point in enumerate(opened)}
+        for j, label in enumerate(found.fitted):
+            k = numbers[label]
+            for name, trial in found.last.items():
+                report.model(f"point_{k}_{name}", trial.fits.models[j], shown=False)
+                report.board.scalars(_live(name, trial, j), step=k)
+            if choice is not None:
+                model = read_law(choice.law, opened[k].parameters)
+                report.model(f"point_{k}_law", model, shown=False)
+
+    @property
+    def _is_signal(self) -> bool:
+        return len(self.source.states) == 1 and not self.models
+
+    @property
+    def _has_quantities(self) -> bool:
+        return any(model.quantities for model in (self.models or {}).values())
+
+    @cached_property
+    def _functions(self) -> LawFunctions:
+        """The functions of a law: a degree, named ones, or those that are chosen."""
+        if self.law is None or isinstance(self.law, int):
+            return self.law or "auto"
+        return named_terms(self._given.names, self.law)
+
+    @cached_property
+    def _given(self) -> GivenPoints:
+        return given_points(self.points, self.parameters, self.source)
+
+    @cached_property
+    def _published(self) -> pd.DataFrame:
+        return read_published(self.thesis or {}, self._given.names)
+
+    @cached_property
+    def _libraries(self) -> dict[str, Library]:
+        """The libraries of the models that are given."""
+        states = self.source.states
+        found = {name: own.library(name, states) for name, own in (self.models or {}).items()}
+        for name, library in found.items():  # relations and functions must hold at some point
+            try:
+                constrain_law(library, library.facts.only, parameters=self._given.names)
+            except ValueError as error:
+                raise ValueError(
+                    f"models.{name} cannot hold: {error} (or leave it out: ~models.{name})"
+                ) from error
+        return found
+
+
+def functions_through(
+    values: Float[np.ndarray, " points"], points: Sequence[Point]
+) -> dict[str, float]:
+    """Factors of the functions of the point that a known value is a sum of, the fewest first.
+
+    It is one number, in proportion to one parameter, or linear in all; in this order the first that
+    is within EXACT of the values, or the last.
+    """
+    names = list(points[0])
+    columns = np.column_stack([np.ones(len(points)), read_points(points, names)])
+    functions = ["1", *names]
+    found: dict[str, float] = {}
+    for chosen in [*([k] for k in range(len(functions))), list(range(len(functions)))]:
+        own = columns[:, chosen]
+        coef = least_squares(own, values)
+        found = dict(zip([functions[k] for k in chosen], coef.tolist(), strict=True))
+        if np.abs(own @ coef - values).max() <= EXACT * np.abs(values).max():
+            break
+    return found
+
+
+def embed_points(opened: Sequence[OpenedPoint]) -> tuple[list[OpenedPoint], Embedded]:
+    """The signal of every point with the states that one embedding makes of it at all points.
+
+    A record that does not oscillate for long enough has no part in it; its status says so.
+    """
+    traces, made = {}, list(opened)
+    for k, point in enumerate(opened):
+        if point.run is not None:
+            made[k] = replace(point, run=None, given=Oscillation.NO_PERIOD)
+            with suppress(ValueError):
+                traces[k] = prepare_signal(point.run)
+    if not traces:
+        raise ValueError("no signal oscillates for six periods: record for longer")
+    states = embed_alike(list(traces.values()))
+    for k, own in zip(traces, states, strict=True):
+        made[k] = replace(opened[k], run=own.run)
+    return made, states[0]
+
+
+def _live(name: str, trial: LawTrial, number: int) -> dict[str, float]:
+    """Scalars that TensorBoard shows for a point: its coefficients, and the loss."""
+    model, fits = trial.fits.models[number], trial.fits
+    scalars = {f"{name}/{s}/{t}": v for s in model.states for t, v in model.terms(s).items()}
+    return scalars | ({f"{name}/loss": fits.losses[number]} if fits.losses else {})

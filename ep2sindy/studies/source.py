@@ -125,17 +125,24 @@ def zones_of(source: Source, field: xr.Dataset, report: Report) -> Zones:
 
     Balances that cannot be made, as of a zone that reaches into the plume, are reported.
     """
+    zones, reason = zones_in(source, field)
+    if reason:
+        report.say(f"the model has no balance of its zone next to it: {reason}")
+    return zones
+
+
+def zones_in(source: Source, field: xr.Dataset) -> tuple[Zones, str]:
+    """The zones that the trajectory is averaged over, and why their balances cannot be made."""
     sampling = source.trajectory
     zones = sampling.parts(field) if {IONS, NEUTRALS} <= set(field.data_vars) else {}
     if any(zone.r is not None or isinstance(zone.z, float) for zone in zones.values()):
         zones = {}
-    balance = partial(zone_balance, field, axisymmetric=sampling.axisymmetric)
+    balance, reason = partial(zone_balance, field, axisymmetric=sampling.axisymmetric), ""
     try:
         balances = {name: balance(zone) for name, zone in zones.items()}
     except ValueError as error:
-        report.say(f"the model has no balance of its zone next to it: {error}")
-        balances = {}
-    return Zones(balances, sampling.sizes(field))
+        balances, reason = {}, str(error)
+    return Zones(balances, sampling.sizes(field)), reason
 
 
 def report_field(report: Report, field: xr.Dataset) -> None:
