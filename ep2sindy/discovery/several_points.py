@@ -50,7 +50,7 @@ from ep2sindy.runtime.progress import Progress, count_pieces
 from ep2sindy.selection.conserving import search_conserving_systems
 from ep2sindy.selection.criteria import EBIC
 from ep2sindy.selection.free_run import FreeRunScore
-from ep2sindy.selection.systems import Systems, Trial, order_together
+from ep2sindy.selection.systems import Systems, Trial, best_together
 
 Problems = Mapping[str, Sequence[RegressionRows]]  # by the label of the point
 
@@ -62,7 +62,7 @@ LONG_WINDOWS = RefinementSettings(n_windows=10, periods=8.0)
 # measured states, and of one that was made of another.
 MOST_COMBINED, SIZES, MADE_SIZES = 27, (2, 3, 4), (4, 5, 6)
 
-N_UNDER_ROLES = 4  # structures under roles whose laws are compared
+N_UNDER_ROLES, N_ALIKE = 6, 2  # structures under roles whose laws are compared, and of one size
 
 FOUND, REFINED = "found", "_refined"  # names of structures, and the end of that of a refinement
 
@@ -324,7 +324,7 @@ class _Search:
         constrain = partial(
             constrain_roles, self.library, one.asked.states, roles=roles, parameters=one.parameters
         )
-        best = order_together(trials, rule.margin)[:N_UNDER_ROLES]
+        best = best_together(trials, rule.margin, N_ALIKE)[:N_UNDER_ROLES]
         return [constrain(systems[0].systems[k].constraint.processes) for k in best]
 
     def fit(self, structures: Sequence[LawConstraint]) -> list[PointFits]:

@@ -44,13 +44,14 @@ def follow_windows(
     each of the windows.
     """
     at = functions.evaluate(fits.columns(functions))
+    starts: list[np.ndarray | None] = [None] * len(runs)
     best, law, tried = _Linearised([], np.inf), fits.pool(functions), fits.pool(functions)
     ahead, fraction = law, 1.0
     for _ in range(MOST_STEPS):
-        found = _linearise_all(fits, tried, at, runs, periods)
+        found = _linearise_all(fits, tried, at, runs, periods, starts)
         gain = best.loss - found.loss
         if gain > 0.0:
-            best, law, fraction = found, tried, 1.0
+            best, law, fraction, starts = found, tried, 1.0, [*found.starts]
             if gain < SETTLED * found.loss:
                 break
             ahead = replace(fits, rows=best.rows).pool(functions)
@@ -64,10 +65,14 @@ def follow_windows(
 
 @dataclass(frozen=True, eq=False)
 class _Linearised:
-    """Rows of all points about a law, and the mean over the points of what windows leave."""
+    """Rows of all points about a law, and the mean over the points of what windows leave.
+
+    starts: of the windows of every point.
+    """
 
     rows: Sequence[tuple[Float[np.ndarray, "free free"], Float[np.ndarray, " free"]]]
     loss: float
+    starts: Sequence[np.ndarray] = ()
 
 
 def _linearise_all(
@@ -76,30 +81,37 @@ def _linearise_all(
     at: Float[np.ndarray, "points functions"],
     runs: Sequence[Trajectory],
     periods: float,
+    near: Sequence[np.ndarray | None],
 ) -> _Linearised:
-    rows, losses = [], []
+    """near: starts of windows by a law that is near, if one is known."""
+    rows, losses, starts = [], [], []
     held = fits.relations.at(fits.points)
-    for model, constraint, f, run in zip(fits.models, held, at, runs, strict=True):
-        z = law @ f
+    for k, (model, constraint, run) in enumerate(zip(fits.models, held, runs, strict=True)):
+        z = law @ at[k]
         moved, _ = with_coef(model, constraint, constraint.coef(z))
-        slope, left, loss = _linearise(moved, constraint, run, periods)
+        slope, left, loss, own = _linearise(moved, constraint, run, periods, near[k])
         rows.append((slope, slope @ z - left))
         losses.append(loss)
-    return _Linearised(rows, float(np.mean(losses)))
+        starts.append(own)
+    return _Linearised(rows, float(np.mean(losses)), starts)
 
 
 def _linearise(
-    model: SparseModel, held: Constraint, run: Trajectory, periods: float
-) -> tuple[Float[np.ndarray, "free free"], Float[np.ndarray, " free"], float]:
+    model: SparseModel,
+    held: Constraint,
+    run: Trajectory,
+    periods: float,
+    near: Float[np.ndarray, "windows n_states"] | None,
+) -> tuple[Float[np.ndarray, "free free"], Float[np.ndarray, " free"], float, np.ndarray]:
     """What windows leave, and its slopes by the free coefficients, starts eliminated.
 
-    Both are triangles of a QR decomposition, over the root of the number of residuals; and the mean
-    square of what is left.
+    Both are triangles of a QR decomposition, over the root of the number of residuals; then the
+    mean square of what is left, and the starts.
     """
     along = Restarts(model, run)
     n_ahead = dominant_window([run], model.states, periods=periods) - 1
     first = along.starts(n_ahead, N_WINDOWS, measured=False)
-    starts = along.fitted(first, n_ahead)
+    starts = along.fitted(first, n_ahead) if near is None else along.nearer(first, n_ahead, near)
 
     def off(of: Restarts, moved: Float[np.ndarray, "windows n_states"]) -> np.ndarray:
         return of.off(of.paths(moved, first, n_ahead), first).reshape(len(first), -1)
@@ -115,11 +127,12 @@ def _linearise(
     moves = np.nan_to_num(np.array(by_start).transpose(1, 2, 0), nan=0.0)
     known = np.isfinite(left).all(axis=1) & np.isfinite(by_coef).all(axis=(0, 2))
     if not known.any():
-        return np.zeros((len(z), len(z))), np.zeros(len(z)), LOST
+        return np.zeros((len(z), len(z))), np.zeros(len(z)), LOST, starts
     rows = np.concatenate([slopes, left[..., None]], axis=-1)[known]
     basis, _ = np.linalg.qr(moves[known])
     rows = (rows - basis @ (basis.transpose(0, 2, 1) @ rows)).reshape(-1, len(z) + 1)
     loss = float(np.square(rows[:, -1]).mean())
     _, triangle = np.linalg.qr(rows / np.sqrt(len(rows)))
     share = float(known.mean())
-    return triangle[: len(z), :-1], triangle[: len(z), -1], share * loss + (1.0 - share) * LOST
+    loss = share * loss + (1.0 - share) * LOST
+    return triangle[: len(z), :-1], triangle[: len(z), -1], loss, starts

@@ -314,18 +314,23 @@ def find_sustained(trials: Sequence[Trial]) -> list[Trial]:
     return [t for t in trials if t.error <= 1.0 and (t.loss < FLOOR or not exact)]
 
 
-def order_together(points: Sequence[Sequence[Trial]], margin: float) -> list[int]:
-    """Indices of systems that were tried at several points, the best first.
+def best_together(points: Sequence[Sequence[Trial]], margin: float, n_alike: int) -> list[int]:
+    """Indices of the systems that do best at several points, `n_alike` of each size.
 
-    points: the trials of each point, in one order of the systems. First come those that are
-    sustained at most points, then those that have room (error up to `margin`) at most, then the
-    smallest, and of equals those of least error in the geometric mean.
+    points: the trials of each point, in one order of the systems. Those are taken that are
+    sustained, and have room (error up to `margin`), at most points; of a size those of least error
+    in the geometric mean.
     """
     errors = np.array([[trial.error for trial in trials] for trials in points])
-    sizes = [trial.system.n_free for trial in points[0]]
+    sizes = np.array([trial.system.n_free for trial in points[0]])
+    failed = [(own > 1.0).sum() * len(own) + (own > margin).sum() for own in errors.T]
     mean = np.log(np.maximum(errors, FLOOR)).mean(axis=0)
-    order = np.lexsort([mean, sizes, (errors > margin).sum(axis=0), (errors > 1.0).sum(axis=0)])
-    found: list[int] = order.tolist()
+    best = [k for k in np.argsort(mean).tolist() if failed[k] == min(failed)]
+    found = [
+        k
+        for size in np.unique(sizes[best]).tolist()
+        for k in [k for k in best if sizes[k] == size][:n_alike]
+    ]
     return found
 
 
