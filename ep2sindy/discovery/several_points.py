@@ -34,7 +34,6 @@ from ep2sindy.operating.left_out import (
     choose_law,
     follow_together,
     leave_out,
-    run_quiet,
 )
 from ep2sindy.operating.point_fits import PointFits, fit_rows, fit_trajectories
 from ep2sindy.operating.quiet import QuietPoint, quiet_points
@@ -60,9 +59,9 @@ LONG_WINDOWS = RefinementSettings(n_windows=10, periods=8.0)
 
 # Most structures that are compared by their laws, and sizes of the supports that they combine: of
 # measured states, and of one that was made of another.
-MOST_COMBINED, SIZES, MADE_SIZES = 27, (2, 3, 4), (4, 5, 6)
+MOST_COMBINED, SIZES, MADE_SIZES = 27, (2, 3, 4), (3, 4, 5, 6)
 
-N_UNDER_ROLES, N_ALIKE = 6, 2  # structures under roles whose laws are compared, and of one size
+N_UNDER_ROLES, N_ALIKE = 6, 3  # structures under roles whose laws are compared, and of one size
 
 FOUND, REFINED = "found", "_refined"  # names of structures, and the end of that of a refinement
 
@@ -233,8 +232,7 @@ class PointsProblem:
                 records=same_point,
             )
         if found is not None:
-            quiet = run_quiet(found.law, self.quiet, self.given)
-            found = replace(found, quiet=quiet, cycle=self.cycle)
+            found = replace(found, cycle=self.cycle)
         joined = join_points(points, self.values, found)
         return replace(joined, data_warnings=(*joined.data_warnings, *self.notes))
 

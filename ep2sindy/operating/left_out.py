@@ -13,12 +13,13 @@ from jaxtyping import Float
 from ep2sindy.data.trajectory import Trajectory, point_label
 from ep2sindy.forecasting.evaluation import Evaluation, evaluate
 from ep2sindy.library.library import Library
+from ep2sindy.model.comparison import Status
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.restarts import Restarts
 from ep2sindy.model.rollout import simulate
 from ep2sindy.model.stability import ATTRACTING_BELOW
 from ep2sindy.operating.interpolation import Interpolation
-from ep2sindy.operating.law import LawFunctions, OperatingLaw, in_hull, read_law
+from ep2sindy.operating.law import LawFunctions, OperatingLaw, read_law
 from ep2sindy.operating.law_fit import follow_windows
 from ep2sindy.operating.point_fits import PointFits, usual_functions
 from ep2sindy.operating.quiet import SMALL, QuietPoint
@@ -28,8 +29,6 @@ from ep2sindy.regression.pooled import fewest_of_least
 from ep2sindy.runtime.parallel import SURROUNDING, Workers, collect
 from ep2sindy.runtime.progress import SILENT, Progress
 
-Runs = Mapping[str, Sequence[Trajectory]]  # by the label of their operating point
-
 N_WINDOWS = 20  # of every record that is left out
 
 # Part of the points inside that the laws of the others must sustain, for a law to be trusted
@@ -38,34 +37,53 @@ TRUSTED = 0.75
 
 HOLDS = 0.9  # part of its own records at which a law must hold, to be preferred to one that fails
 
-# Runs at quiet points: periods, samples, and those of the record's end that a run begins with.
-LONG, N_SAMPLES, N_LAST = 100.0, 2000, 5
+LONG, N_SAMPLES = 100.0, 2000  # periods and samples of a run at a quiet point
+
+WORST = 5.0  # deviation, in units of its bound, of a run that does not hold
 
 
 @dataclass(frozen=True, eq=False)
 class LeftOutRun:
     """A free run of one point with the law fitted to the other points.
 
-    The run starts at one sample of the point's record. inside: True if the other points enclose
-    this one. interpolated: its errors of `Interpolation`, or NaN where the others do not enclose
-    it, or do not repeat cycles.
+    inside: True if the other points enclose this one. interpolated: its errors of `Interpolation`,
+    or NaN where the others do not enclose it, or do not repeat cycles.
     """
 
     record: OperatingRecord
     run: Evaluation
     inside: bool
-    interpolated: Mapping[str, float]
-
-    @property
-    def attracts(self) -> bool:
-        """True if the run ends on a cycle that attracts, and so sets the amplitude by itself."""
-        return self.run.multiplier < ATTRACTING_BELOW
+    interpolated: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def amplitude_error(self) -> float:
         """Relative error of the amplitude of the worst state that is assessed."""
         ratios = np.array([*self.run.amplitude_ratio.values()])[list(self.run.assessed)]
         return float(np.abs(ratios - 1.0).max())
+
+    @property
+    def waveform_error(self) -> float:
+        """Error of the waveform of the worst state that is assessed."""
+        return float(np.array([*self.run.waveform_error.values()])[list(self.run.assessed)].max())
+
+    @property
+    def deviation(self) -> float:
+        """Largest error in units of its bound; zero of a run that follows the samples.
+
+        At most it is WORST, that of a run that fails: one that does not hold has to attract, since
+        a neutral cycle keeps the amplitude of its start.
+        """
+        run, bounds = self.run, self.run.bounds
+        if run.status is Status.FOLLOWS:
+            return 0.0
+        errors = (
+            abs(run.f_error) / bounds.frequency,
+            self.amplitude_error / bounds.amplitude,
+            self.waveform_error / bounds.waveform,
+        )
+        if not np.isfinite(errors).all() or not (run.holds or run.multiplier < ATTRACTING_BELOW):
+            return 0.0 if run.holds else WORST
+        return min(max(errors), WORST)
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,23 +121,40 @@ class LawTrial:
     @cached_property
     def fitted(self) -> list[Evaluation]:
         """The law of all points over each of its records."""
-        models = [read_law(self.law, record.parameters) for record in self.records]
-        pairs = zip(models, self.records, strict=True)
-        return [evaluate(model, r.from_slowest, assessed=self.assessed) for model, r in pairs]
+        at = [(record, read_law(self.law, record.parameters)) for record in self.records]
+        return [run_freely(model, record, self.assessed) for record, model in at]
 
     @cached_property
-    def holds(self) -> bool:
-        """Whether the law holds at most of the records that it was fitted to."""
+    def held(self) -> float:
+        """Part of the records that the law was fitted to at which it holds, no more than HOLDS.
+
+        It is not asked of a model that inputs drive.
+        """
         if self.fits.models[0].inputs:
-            return True  # which is not asked of a model that inputs drive
-        return sum(run.holds for run in self.fitted) >= HOLDS * len(self.records)
+            return HOLDS
+        return min(HOLDS, sum(run.holds for run in self.fitted) / len(self.records))
+
+    @cached_property
+    def left_out(self) -> list[LeftOutRun]:
+        """Every record run freely with the law of the others."""
+        runs = []
+        for k, record in enumerate(self.records):
+            law = self.fits.law_without(k, self.functions)
+            run = run_freely(read_law(law, record.parameters), record, self.assessed)
+            runs.append(LeftOutRun(record, run, law.is_inside(record.parameters)))
+        return runs
+
+    @cached_property
+    def rests(self) -> list[bool]:
+        """Whether the law rests, at each of the points whose record is quiet."""
+        return [_rests(self.law, point) for point in self.fits.quiet]
 
     @property
-    def between(self) -> Float[np.ndarray, " _"]:
-        """The errors at points that the others enclose, where laws are read; else all of them."""
-        points = self.fits.columns(self.functions)
-        inside = [in_hull(np.delete(points, k, axis=0), p) for k, p in enumerate(points)]
-        return self.errors[inside] if any(inside) else self.errors
+    def score(self) -> float:
+        """Mean `deviation` of the runs left out between others, and at quiet points."""
+        between = [run.deviation for run in self.left_out if run.inside]
+        own = between or [run.deviation for run in self.left_out]
+        return float(np.mean([*own, *(0.0 if rests else WORST for rests in self.rests)]))
 
 
 def follow_together(
@@ -135,7 +170,7 @@ def follow_together(
     for functions in start.fits.candidates(law):
         together = follow_windows(start.fits, functions, runs, periods=periods)
         trials.append(replace(start, fits=together, functions=functions))
-        if trials[-1].holds:
+        if trials[-1].held == HOLDS:
             break
     return trials
 
@@ -193,45 +228,30 @@ def window_errors(
     return np.array(found)
 
 
-def run_left_out(trial: LawTrial, between: Interpolation | None = None) -> list[LeftOutRun]:
-    """Run every record freely with the law of the others; beside it their interpolation."""
-    runs, errors = [], None if between is None else between.errors
-    for k, record in enumerate(trial.records):
-        law = trial.fits.law_without(k, trial.functions)
-        model = read_law(law, record.parameters)
-        run = evaluate(model, record.from_slowest, assessed=trial.assessed)
-        inside = law.is_inside(record.parameters)
-        off = np.full(2, np.nan) if errors is None or not inside else errors[k]
-        interpolated = dict(zip(("frequency", "amplitude"), off.tolist(), strict=True))
-        runs.append(LeftOutRun(record, run, inside, interpolated))
-    return runs
+def run_freely(
+    model: SparseModel, record: OperatingRecord, assessed: Sequence[str] | None
+) -> Evaluation:
+    """Run from the record's slowest sample, or from the place on its mean cycle next to it.
 
-
-@dataclass(frozen=True, eq=False)
-class QuietRun:
-    """The law of all points at one whose record is quiet, from the record's last state.
-
-    rests: whether the run stays as quiet as the record is.
+    During a pulse, a small error of the model is a large one in phase; and states that were made of
+    others are poor at the ends of a record.
     """
+    if not record.repeats or model.inputs:
+        return evaluate(model, record.run, assessed=assessed)
+    cycle, k = record.cycle, record.slowest
+    columns = [record.run.state_names.index(state) for state in model.states]
+    start = cycle.waveform(cycle.phase[[k]])[0][columns]
+    return evaluate(model, record.from_slowest, initial=start, assessed=assessed)
 
-    record: Trajectory
-    rests: bool
 
-
-def run_quiet(law: OperatingLaw, points: Sequence[QuietPoint], runs: Runs) -> list[QuietRun]:
-    """Run the law at quiet points, for as long as the record or a hundred periods."""
-    found = []
-    for point in points:
-        for run in runs[point_label(point.parameters)]:
-            t = np.linspace(0.0, max(run.t[-1] - run.t[0], LONG * point.period_s), N_SAMPLES)
-            model = read_law(law, point.parameters)
-            end = np.nanmean(run.columns(model.states)[-N_LAST:], axis=0)
-            reach = np.abs(end) + point.scale
-            path = simulate(model, t, end, None, blow_up=1e3, reach=reach).states
-            late = path[N_SAMPLES // 2 :]
-            rests = np.isfinite(late).all() and (late.std(axis=0) < SMALL * point.scale).all()
-            found.append(QuietRun(run, bool(rests)))
-    return found
+def _rests(law: OperatingLaw, point: QuietPoint) -> bool:
+    """Whether the law's model decays from a disturbance as large as a quiet record may vary."""
+    t = np.linspace(0.0, LONG * point.period_s, N_SAMPLES)
+    start = point.rest + SMALL * point.scale
+    reach = np.abs(start) + point.scale
+    model = read_law(law, point.parameters)
+    path = simulate(model, t, start, None, blow_up=1e3, reach=reach).states[N_SAMPLES // 2 :]
+    return bool(np.isfinite(path).all() and (path.std(axis=0) < SMALL * point.scale).all())
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,14 +260,13 @@ class LawChoice:
 
     trials: all that was tried. choice: the one whose law is taken. cycle: name of the records'
     cycle; "all" if there is only one. runs: of the points left out, each with the law of the
-    others; empty if there are too few points, or if inputs drive the model. quiet: of the points
-    whose records are quiet. interpolation: of the records, without a model; None if there is none.
+    others; empty if there are too few points, or if inputs drive the model. interpolation: of the
+    records, without a model; None if there is none.
     """
 
     trials: Sequence[LawTrial]
     choice: LawTrial
     runs: Sequence[LeftOutRun]
-    quiet: Sequence[QuietRun] = ()
     interpolation: Interpolation | None = None
     cycle: str = "all"
 
@@ -263,6 +282,12 @@ class LawChoice:
     def fitted(self) -> list[Evaluation]:
         """The law of all points over each of its records."""
         return self.choice.fitted
+
+    @property
+    def quiet(self) -> dict[str, bool]:
+        """Whether the law rests, by the label of each point whose record is quiet."""
+        labels = [point_label(point.parameters) for point in self.choice.fits.quiet]
+        return dict(zip(labels, self.choice.rests, strict=True))
 
     @property
     def inside(self) -> list[LeftOutRun]:
@@ -320,27 +345,38 @@ class LawChoice:
 
 
 def choose_law(trials: Sequence[LawTrial]) -> LawChoice:
-    """The trial of fewest numbers among those that err least at points left out between others.
+    """The law whose runs deviate least at points left out between others.
 
-    Laws that hold at the records that they were fitted to come before others. Of models that run
-    freely, it is the best of those that hold or attract at more than half of the points left out,
-    if there are any: a neutral cycle keeps the amplitude of its start.
+    Laws that hold at the records that they were fitted to come before others. Of models that inputs
+    drive, it is the law of fewest numbers among those that err least over windows left out.
     trials: as `leave_out` returns them; without errors the last one is taken.
     """
-    tested, first = [trial for trial in trials if len(trial.errors)], None
-    left = [trial for trial in tested if trial.holds] or tested
-    one = trials[0]
+    one, tested = trials[0], [trial for trial in trials if len(trial.errors)]
     states = one.assessed or one.fits.models[0].states
     between = Interpolation.best(usual_functions(one.fits.parameters), one.records, states)
-    while left:
-        best = left.pop(fewest_of_least([(trial.between, trial.n_numbers) for trial in left]))
-        if best.fits.models[0].inputs:
-            return LawChoice(trials, best, [])
-        found = LawChoice(trials, best, run_left_out(best, between), interpolation=between)
-        first = first or found
-        if 2 * sum(run.run.holds or run.attracts for run in found.runs) > len(found.runs):
-            return found
-    return first or LawChoice(trials, trials[-1], [], interpolation=between)
+    if not tested:
+        return LawChoice(trials, trials[-1], [], between)
+    if one.fits.models[0].inputs:
+        place = fewest_of_least([(trial.errors, trial.n_numbers) for trial in tested])
+        return LawChoice(trials, tested[place], [], between)
+    most = max(trial.held for trial in tested)
+    best = min((t for t in tested if t.held == most), key=lambda t: (t.score, t.error))
+    return LawChoice(trials, best, _beside(best.left_out, between), between)
+
+
+def _beside(runs: Sequence[LeftOutRun], between: Interpolation | None) -> list[LeftOutRun]:
+    """The runs with the errors of interpolation, where the other points enclose theirs."""
+    nothing = np.full((len(runs), 2), np.nan)
+    errors = (
+        nothing
+        if between is None
+        else np.where([[r.inside] for r in runs], between.errors, nothing)
+    )
+    names = ("frequency", "amplitude")
+    return [
+        replace(run, interpolated=dict(zip(names, own.tolist(), strict=True)))
+        for run, own in zip(runs, errors, strict=True)
+    ]
 
 
 def error_statistics(left_out: Sequence[LeftOutRun]) -> dict[str, float | int]:
@@ -353,7 +389,7 @@ def error_statistics(left_out: Sequence[LeftOutRun]) -> dict[str, float | int]:
     f = np.array([abs(each.run.f_error) for each in left_out])
     f[np.isnan(f)] = np.inf
     amplitude = np.array([each.amplitude_error for each in left_out])
-    waveform = np.array([max(each.run.waveform_error.values()) for each in left_out])
+    waveform = np.array([each.waveform_error for each in left_out])
     inside = np.array([each.inside for each in left_out])
     between = np.array([[*each.interpolated.values()] for each in left_out])
     return {

@@ -326,12 +326,11 @@ def best_together(points: Sequence[Sequence[Trial]], margin: float, n_alike: int
     failed = [(own > 1.0).sum() * len(own) + (own > margin).sum() for own in errors.T]
     mean = np.log(np.maximum(errors, FLOOR)).mean(axis=0)
     best = [k for k in np.argsort(mean).tolist() if failed[k] == min(failed)]
-    found = [
+    return [
         k
         for size in np.unique(sizes[best]).tolist()
         for k in [k for k in best if sizes[k] == size][:n_alike]
     ]
-    return found
 
 
 def list_others(sustained: Sequence[Trial], winner: Trial) -> list[OtherSystem]:

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from ep2sindy.data.trajectory import point_label
 from ep2sindy.discovery.result import Discovery
 from ep2sindy.discovery.several_points import REFINED
 from ep2sindy.figures.operating import cycle_figure, laws_figure, rows_at, trends_figure
@@ -166,8 +165,10 @@ def _outcomes(found: PointsFound, choice: LawChoice) -> list[str]:
     """By point: the law next to the record that it was fitted to, or by itself."""
     pairs = zip(choice.records, choice.fitted, strict=True)
     runs = {record.label: run.text for record, run in pairs}
-    runs |= {point_label(q.record.parameters): ALONE[Status.DECAYS] if q.rests else "moves"
-             for q in choice.quiet}  # fmt: skip
+    runs |= {
+        label: ALONE[Status.DECAYS if rests else Status.SUSTAINED]
+        for label, rests in choice.quiet.items()
+    }
     at_points = zip(found.opened, found.maps, strict=False)
     return [runs.get(point.label, ALONE[at.status]) for point, at in at_points]
 
@@ -318,12 +319,12 @@ def _add_map(
     elif over:
         report.add("Nowhere on the map does the law's model oscillate.")
     n_right, n_quiet = sum(run.holds for run in choice.fitted), len(choice.quiet)
-    n_rests = sum(run.rests for run in choice.quiet)
+    n_rests = sum(choice.quiet.values())
     report.headline |= {"n_fitted_sustained": n_right, "n_quiet": n_quiet, "n_rests": n_rests}
     text = f"The law of all points holds at {n_right} of the {len(choice.fitted)} it was fitted to"
     if n_quiet:
         text += f", and rests at {n_rests} of {n_quiet} whose record is quiet"
-    known = {*found.fitted} | {point_label(each.record.parameters) for each in choice.quiet}
+    known = {*found.fitted, *choice.quiet}
     rest = [point.status for point in found.opened if point.label not in known]
     return f"{text}; not counted: {', '.join(rest)}." if rest else f"{text}."
 

@@ -217,7 +217,7 @@ class Study:
             ]
         choice = None if first.law is None else first.law_choice
         if choice is not None and len(by_model) > 1:
-            choice = replace(choose_law(trials), quiet=choice.quiet, cycle=choice.cycle)
+            choice = replace(choose_law(trials), cycle=choice.cycle)
         elif choice is not None:
             taken = trials[[t is choice.choice for t in choice.trials].index(True)]
             choice = replace(choice, trials=trials, choice=taken)
