@@ -13,7 +13,7 @@ from scipy.special import ndtri
 from ep2sindy.data.trajectory import point_label
 from ep2sindy.figures.operating import processes_figure
 from ep2sindy.library.relations import Constraint
-from ep2sindy.library.roles import ALONE
+from ep2sindy.library.roles import ROLELESS
 from ep2sindy.operating.law import OperatingLaw, read_law
 from ep2sindy.operating.left_out import LawChoice
 from ep2sindy.operating.quantities import lines_of
@@ -112,7 +112,7 @@ def _at_point(
     record: OperatingRecord, held: Constraint, zones: Zones, law: OperatingLaw
 ) -> list[ComparedProcess]:
     """The processes of a law at a record, without terms of states that have no roles."""
-    moving = [each for each in (*held.processes, *held.known) if not each.role.endswith(ALONE)]
+    moving = [each for each in (*held.processes, *held.known) if not each.role.endswith(ROLELESS)]
     model, ends = read_law(law, record.parameters), [ends_of(process) for process in moving]
     compared = compared_processes(model, held, record.run, zones)
     return [process for process in compared if process.ends in ends]
