@@ -152,7 +152,8 @@ def test_a_table_has_a_row_for_each_process_and_a_column_for_each_point(report: 
     choice = choice_of(LINE)
     add_processes(report, choice, told(choice), {})
     seen, every = tables(report)
-    assert list(seen.rows) == ["process", "unit", "V=200", "V=250", "V=300", "V=400"]
+    assert list(seen.rows) == ["process", "V=200", "V=250", "V=300", "V=400"]
+    assert seen.title == "in m^-3 s^-1"
     assert seen.rows["V=200"].iloc[0] == "2.00"  # known
     assert seen.rows["V=200"].iloc[2].endswith("(2.00)")
     assert "±" in seen.rows["V=200"].iloc[2]
@@ -165,10 +166,9 @@ def test_of_many_points_the_longest_line_is_shown(report: Report) -> None:
     choice = choice_of(GRID, replace(ROLES, inflow={"n_n": 3e22}))
     add_processes(report, choice, {}, {})
     seen = tables(report)[0]
-    assert list(seen.rows)[2::7] == ["V=200", "V=400"]
-    assert len(seen.rows.columns) == 2 + 8
-    assert seen.title == "at m=4"
-    assert seen.rows["unit"].iloc[0] == "10^22 m^-3 s^-1"
+    assert list(seen.rows)[1::7] == ["V=200", "V=400"]
+    assert len(seen.rows.columns) == 1 + 8
+    assert seen.title == "in 10^22 m^-3 s^-1, at m=4"
     assert seen.rows["V=400"].iloc[0] == "3.00"
     assert len(report.tables["processes"]) == 4 * 18
 

@@ -179,7 +179,7 @@ def _on_a_line(records: Sequence[OperatingRecord]) -> list[OperatingRecord]:
 def _side_by_side(
     found: Sequence[PointProcess], records: Sequence[OperatingRecord]
 ) -> tuple[pd.DataFrame, str]:
-    """A row per process with its unit, and a column per record; and what these have in common."""
+    """A row per process, a column per record, and a title of what all rates have in common."""
     first = records[0].parameters
     held = {k: v for k, v in first.items() if all(r.parameters[k] == v for r in records)}
     varying = [name for name in first if name not in held] or list(first)
@@ -195,7 +195,10 @@ def _side_by_side(
             row = rows.setdefault(each.process.name, {"process": each.process.name, "unit": words})
             header = point_label({name: each.record.parameters[name] for name in varying})
             row[header] = each.cell(per * 10.0**power)
-    return pd.DataFrame([*rows.values()]), f"at {point_label(held)}" if held else ""
+    table, title = pd.DataFrame([*rows.values()]), [f"at {point_label(held)}"] if held else []
+    if table["unit"].nunique() == 1:
+        title.insert(0, f"in {table.pop('unit')[0]}")
+    return table, ", ".join(title)
 
 
 def _left_out(found: Sequence[PointProcess]) -> str:
