@@ -52,6 +52,7 @@ HEAVY = {
         "studies.law_tables",
         "studies.quantity_tables",
         "studies.points",
+        "studies.point_processes",
     ),
     "hydra": ("app",),
     "omegaconf": ("app",),

@@ -8,7 +8,8 @@ mark stands at its own point.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from itertools import cycle
+from itertools import chain, cycle
+from textwrap import wrap
 from typing import Any
 
 import numpy as np
@@ -97,7 +98,8 @@ def _coef_title(law: OperatingLaw, state: str, term: str) -> str:
 
 def _panel_width(titles: Sequence[str], least: float) -> float:
     """Width in inches of panels that these titles fit above, at least this one."""
-    widest = max(TextPath((0, 0), title, size=TITLE).get_extents().width for title in titles)
+    lines = chain(*(title.splitlines() for title in titles))
+    widest = max(TextPath((0, 0), line, size=TITLE).get_extents().width for line in lines)
     return max(least, widest / 72.0 + 0.3)
 
 
@@ -246,6 +248,7 @@ def trends_figure(
     *,
     trends: Sequence[tuple[str, Mapping[str, float]]],
     labels: Mapping[str, str],
+    from_zero: bool = False,
 ) -> Figure:
     """Quantities of one fit against one parameter at a time, the others held, with 95 % intervals.
 
@@ -253,7 +256,8 @@ def trends_figure(
     quantity, in several blocks if they are many. The first kind is drawn filled, the others open.
     laws: by quantity, of the first kind, drawn as lines between its points. trends: one row of
     panels each, (parameter, values of the others). labels: names of parameters and quantities on
-    axes; by default their own.
+    axes; by default their own. from_zero: whether axes hold zero, and thin lines join the marks of
+    the first kind.
     """
     marks: dict[str, dict[str, Any]] = {
         kind: {"color": colour, "marker": marker, "ms": 5, "mfc": "none" if k else colour}
@@ -269,7 +273,14 @@ def trends_figure(
         of_quantity[0].set_title(title, fontsize=TITLE, y=1.0, pad=14.0)
         for ax, (along, at) in zip(of_quantity, trends, strict=True):
             ax.sharey(of_quantity[0])
-            _draw_trend(ax, rows_at(shown, at), along, at, laws.get(quantity), marks)
+            own = rows_at(shown, at)
+            _draw_trend(ax, own, along, at, laws.get(quantity), marks)
+            if from_zero:
+                first = rows_at(own, {"kind": estimates["kind"].iloc[0]}).sort_values(along)
+                ax.plot(first[along], first["value"], color=COLOURS[0], lw=0.8, zorder=1)
+                ax.axhline(0.0, color=DATA, lw=0.5, zorder=1)
+                reached = shown[["low", "high"]].to_numpy(float).ravel()
+                ax.set_ylim(style.frame_limits(np.append(shown["value"], 0.0), reached))
             ax.set_xlabel(style.name_label(along, labels))
             if at and ax.get_subplotspec().is_first_col():
                 ax.set_ylabel(f"at {style.held_label(at, labels)}".replace(", ", ",\n"))
@@ -318,3 +329,21 @@ def _draw_trend(
         ax.plot(line, law.predict(points), color=COLOURS[0], lw=1.2, zorder=1)
     ax.margins(x=0.1)
     ax.grid(alpha=0.3)
+
+
+def processes_figure(
+    rates: pd.DataFrame,
+    *,
+    trends: Sequence[tuple[str, Mapping[str, float]]],
+    labels: Mapping[str, str],
+    unit: str,
+) -> Figure:
+    """Mean rates of processes against one parameter at a time: see `trends_figure`.
+
+    Its quantities are the processes. Panels show zero, so that the eye compares rates and not only
+    their changes. unit: of all rates.
+    """
+    titles = {name: "\n".join(wrap(name, 28)) for name in dict.fromkeys(rates["quantity"])}
+    figure = trends_figure(rates, {}, trends=trends, labels={**labels, **titles}, from_zero=True)
+    figure.supylabel(style.axis_label("rate", unit), fontsize=TITLE)
+    return figure

@@ -495,7 +495,8 @@ def _independent_rows(matrix: Float[np.ndarray, "rows columns"]) -> np.ndarray:
 
 
 IN, OUT = " in", " out"  # what enters is written first, and what leaves last
-SEPARATE = (IN, " free", " known")  # roles whose terms are written one by one
+ROLELESS = (" free", " known")  # terms of states without roles, which move nothing
+SEPARATE = (IN, *ROLELESS)  # roles whose terms are written one by one
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from ep2sindy.data.numbers import least_squares
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import polynomial
 from ep2sindy.library.relations import Constraint, Process
-from ep2sindy.library.roles import process_amounts
+from ep2sindy.library.roles import process_amounts, process_matrix
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.scores import r2
 
@@ -104,6 +104,7 @@ class ComparedProcess:
     ends: the state that gives, and the one that takes; "" is the outside. recorded: None if the
     record does not give it. coef: of the model's terms. counterpart: of the same terms, by least
     squares on the record; empty if it does not give the process. fit_r2: of these, at each instant.
+    std: standard error of the mean of `modelled`; zero if all is known, NaN if it cannot be told.
     """
 
     name: str
@@ -113,6 +114,7 @@ class ComparedProcess:
     coef: Mapping[str, float]
     counterpart: Mapping[str, float] = field(default_factory=dict)
     fit_r2: float = float("nan")
+    std: float = float("nan")
 
     @property
     def ratio(self) -> float:
@@ -130,7 +132,9 @@ class ComparedProcess:
 def compared_processes(
     model: SparseModel, held_to: Constraint, data: Trajectory, zones: Zones
 ) -> list[ComparedProcess]:
-    """The processes of ions and neutrals, in zones and between them, in record and model.
+    """The processes of a model next to those of the record, in zones and between them.
+
+    A record may tell those of ions and neutrals; others have the names of their roles.
 
     held_to: the model's constraint, from a search under `Roles`. Rates are those of the zone that
     gives, or takes from outside. Where ions give back by a process of their own, ionization is the
@@ -139,8 +143,11 @@ def compared_processes(
     """
     theta = model.library.evaluate(data.columns(model.library.variables))
     found: dict[tuple[str, str], dict[str, float]] = {}
+    roles: dict[tuple[str, str], dict[str, None]] = {}
     for process, amount in process_amounts(held_to, {s: model.terms(s) for s in model.states}):
         found.setdefault(ends_of(process), {})[process.term] = amount
+        roles.setdefault(ends_of(process), {})[process.role] = None
+    covariance, means = _amount_covariance(model, held_to), theta.mean(axis=0)
     known = {zone: recorded_rates(balance, data) for zone, balance in zones.balances.items()}
     gone = _through_ends(known, zones.sizes or dict.fromkeys(known, 1.0))
     given = {ends_of(process) for process in held_to.known}
@@ -150,14 +157,35 @@ def compared_processes(
     for ends, terms in sorted(found.items(), key=lambda each: (bool(each[0][0]), not each[0][1])):
         columns = theta[:, [model.library.index(term) for term in terms]]
         gross = ends[::-1] in found if ends[0] else ends[1] in leaving or ends in given
-        rate = _zone_rate(*ends, known, gone, gross=gross)
+        words = _zone_words(*ends, gross=gross)
+        rate = _zone_rate(*ends, known, gone, gross=gross) if words else None
         modelled = columns @ np.array([*terms.values()])
         beside = fitted_rate(rate, columns, list(terms)) if rate is not None else FittedRate({})
-        words = _zone_words(*ends, gross=gross)
+        per_amount = [
+            means[model.library.index(process.term)] * (ends_of(process) == ends)
+            for process in held_to.processes
+        ]
+        std = float(np.sqrt(max(per_amount @ covariance @ per_amount, 0.0)))
         compared.append(
-            ComparedProcess(words, ends, rate, modelled, terms, beside.terms, beside.r2)
-        )
+            ComparedProcess(
+                words or " and ".join(roles[ends]), ends, rate, modelled, terms, beside.terms,
+                beside.r2, std,
+            )
+        )  # fmt: skip
     return compared
+
+
+def _amount_covariance(
+    model: SparseModel, held: Constraint
+) -> Float[np.ndarray, "processes processes"]:
+    """Covariance of the coefficients of the processes to be found; NaN if the model has none."""
+    if model.covariance is None:
+        return np.full((len(held.processes), len(held.processes)), np.nan)
+    used = [(model.states[k], model.library.names[j]) for k, j in np.argwhere(model.coef.T)]
+    free = [held.coefficients[k] for k in held.free]
+    chosen = np.array([[place == other for other in used] for place in free], dtype=np.float64)
+    spread = np.linalg.solve(process_matrix(held), chosen)
+    return spread @ model.covariance @ spread.T
 
 
 def ends_of(process: Process) -> tuple[str, str]:
@@ -177,7 +205,7 @@ def _through_ends(
     for state, key in ((IONS, "exit_i"), (NEUTRALS, "exit_n")):
         passed: Any = 0.0
         for zone, size in sizes.items():
-            if key not in known[zone]:
+            if key not in known.get(zone, {}):
                 break
             passed = passed + size * known[zone][key]
             found[state, zone] = passed / size
@@ -189,8 +217,11 @@ def _zone(state: str) -> str:
 
 
 def _zone_words(giver: str, taker: str, *, gross: bool) -> str:
+    """What the balance calls a process of ions and neutrals; empty for other states."""
     (state, _, zone), (other, _, beyond) = giver.partition("@"), taker.partition("@")
-    names = {IONS: "ions", NEUTRALS: "neutrals"}
+    names = {IONS: "ions", NEUTRALS: "neutrals", "": ""}
+    if not {state, other} <= {*names}:
+        return ""
     if not giver:
         return f"{names[other]} that enter{'' if gross else ', less those that leave'}"
     if not taker:
@@ -219,14 +250,15 @@ def _zone_rate(
     """
     (state, _, zone), (other, _, beyond) = giver.partition("@"), taker.partition("@")
     if not giver:
-        supply = known[beyond].get("supply") if other == NEUTRALS else None
+        supply = known.get(beyond, {}).get("supply") if other == NEUTRALS else None
         left = 0.0 if gross else gone.get((other, beyond))
         return None if supply is None or left is None else supply - left
     if not taker or zone != beyond:  # to the outside, or to the next zone
         return gone.get((state, zone))
+    own = known.get(zone, {})
     if gross:
-        return known[zone].get("ionization" if state == NEUTRALS else "returned")
-    if not {"ionization", "returned"} <= set(known[zone]):
+        return own.get("ionization" if state == NEUTRALS else "returned")
+    if not {"ionization", "returned"} <= {*own}:
         return None
-    exchanged = known[zone]["ionization"] - known[zone]["returned"]
+    exchanged = own["ionization"] - own["returned"]
     return exchanged if state == NEUTRALS else -exchanged
