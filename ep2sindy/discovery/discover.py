@@ -180,11 +180,12 @@ def _discover_together(
 ) -> Discovery:
     """One structure for all points, and the law of its coefficients if one is asked for."""
     # This loads torch, only for a law or a structure of several operating points.
-    from ep2sindy.discovery.several_points import LawSearch, PointsProblem
+    from ep2sindy.discovery.several_points import LawSearch, discover_together
 
     asked = law if law is None or isinstance(law, LawSearch) else LawSearch(law)
-    several = PointsProblem(task, _points_of(task), method, asked, workers)
-    return several.discover(rng=rng, progress=progress)
+    return discover_together(
+        task, _points_of(task), method, asked, workers=workers, rng=rng, progress=progress
+    )
 
 
 def _discover_point(

@@ -29,6 +29,7 @@ from ep2sindy.operating.law import (
     read_law,
 )
 from ep2sindy.operating.left_out import (
+    HOLDS,
     LawChoice,
     LawTrial,
     choose_law,
@@ -91,19 +92,64 @@ class LawSearch:
     windows: RefinementSettings | None = None
 
 
+def discover_together(
+    asked: DiscoveryProblem,
+    given: Mapping[str, Sequence[Trajectory]],
+    method: DiscoveryMethod,
+    law: LawSearch | None,
+    *,
+    workers: Workers,
+    rng: np.random.Generator,
+    progress: Progress,
+) -> Discovery:
+    """One structure for all points, and the law of its coefficients if one is asked for.
+
+    At points whose records rest, between others whose records repeat cycles, the law has to rest.
+    If no law holds at most of its records and these are on two cycles, it is that of the cycle that
+    most are on. given: the runs of each point, by its label.
+    """
+    quiet = [] if law is None else quiet_points(given.values(), asked.states)
+    aside = {point_label(point.parameters) for point in quiet}
+    records = {k: OperatingRecord(runs[0]) for k, runs in given.items() if k not in aside}
+    repeat = bool(records) and all(record.repeats for record in records.values())
+    points = {k: runs for k, runs in given.items() if not (repeat and k in aside)}
+    problem = PointsProblem(asked, points, method, law, workers, quiet if repeat else [])
+    found = problem.discover(rng=rng, progress=progress)
+    choice = found.law_choice
+    if choice is None or choice.choice.held == HOLDS or not repeat:
+        return found
+    numbers = branches_of([*records.values()])
+    main = int(2 * numbers.sum() > len(numbers))
+    others = [label for label, number in zip(records, numbers, strict=True) if number != main]
+    if not others:
+        return found
+    one = replace(problem, points={k: runs for k, runs in points.items() if k not in others})
+    found = one.discover(rng=rng, progress=progress)
+    assert found.law_choice is not None
+    cycle = ("strong", "weak")[main]
+    note = (
+        f"two cycles coexist: the law is that of the {len(one.points)} points on the {cycle} one; "
+        f"on the other are {', '.join(others)}"
+    )
+    choice = replace(found.law_choice, cycle=cycle)
+    return replace(found, law_choice=choice, data_warnings=(*found.data_warnings, note))
+
+
 @dataclass(frozen=True, eq=False)
 class PointsProblem:
     """What is asked of several operating points together, and the method that answers it.
 
-    given: the runs of each point, by its label. law: None asks for one structure alone.
+    points: the runs of each point, by its label. law: None asks for one structure alone. quiet:
+    other points, where the law has to rest.
     Raises ValueError for hidden states, or a method that cannot weigh all points at once.
     """
 
     asked: DiscoveryProblem
-    given: Mapping[str, Sequence[Trajectory]]
+    points: Mapping[str, Sequence[Trajectory]]
     method: DiscoveryMethod
     law: LawSearch | None
     workers: Workers
+    quiet: Sequence[QuietPoint] = ()
 
     def __post_init__(self) -> None:
         if self.asked.hidden:
@@ -144,56 +190,6 @@ class PointsProblem:
             return None
         return LONG_WINDOWS if self.asked.made else WINDOWS
 
-    @cached_property
-    def quiet(self) -> list[QuietPoint]:
-        """Points whose records rest, where the law must; none unless all others repeat cycles."""
-        found = [] if self.law is None else quiet_points(self.given.values(), self.asked.states)
-        labels = {point_label(point.parameters) for point in found}
-        loud = [runs for label, runs in self.given.items() if label not in labels]
-        return found if loud and all(OperatingRecord(runs[0]).repeats for runs in loud) else []
-
-    @cached_property
-    def _branches(self) -> dict[str, int]:
-        """Number of the cycle of every record that repeats one: 0 on the stronger, or only, one."""
-        quiet = {point_label(point.parameters) for point in self.quiet}
-        records = {k: OperatingRecord(runs[0]) for k, runs in self.given.items() if k not in quiet}
-        loud = {label: record for label, record in records.items() if record.repeats}
-        if self.law is None or not loud:
-            return {}
-        return dict(zip(loud, branches_of(list(loud.values())).tolist(), strict=True))
-
-    @property
-    def _main(self) -> int:
-        """The cycle that most records are on."""
-        return int(2 * sum(self._branches.values()) > len(self._branches))
-
-    @property
-    def cycle(self) -> str:
-        """Name of the cycle of the law: "all" if there is only one, else "strong" or "weak"."""
-        return ("strong", "weak")[self._main] if any(self._branches.values()) else "all"
-
-    @cached_property
-    def points(self) -> dict[str, Sequence[Trajectory]]:
-        """The runs of every point that is fitted: neither quiet nor on another cycle than most."""
-        quiet = {point_label(point.parameters) for point in self.quiet}
-        main = {label: self._branches.get(label, self._main) for label in self.given}
-        return {
-            label: runs
-            for label, runs in self.given.items()
-            if label not in quiet and main[label] == self._main
-        }
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """What is said of points that are not fitted."""
-        others = [label for label, number in self._branches.items() if number != self._main]
-        if not others:
-            return ()
-        return (
-            f"two cycles coexist: the law is that of the {len(self.points)} points on the "
-            f"{self.cycle} one; on the other are {', '.join(others)}",
-        )
-
     @property
     def roles(self) -> Roles | None:
         return self.asked.facts.roles
@@ -231,10 +227,7 @@ class PointsProblem:
                 constraint=fits.relations.at(fits.points[[k]])[0],
                 records=same_point,
             )
-        if found is not None:
-            found = replace(found, cycle=self.cycle)
-        joined = join_points(points, self.values, found)
-        return replace(joined, data_warnings=(*joined.data_warnings, *self.notes))
+        return join_points(points, self.values, found)
 
     def _rows(self, rng: np.random.Generator, progress: Progress) -> Problems:
         """Rows of every point, made in the order of their names, so that theirs does not count."""
@@ -354,13 +347,14 @@ class _Search:
         return rows.models
 
     def choose(self, law: LawFunctions | Sequence[LawFunctions]) -> LawChoice:
-        """The law that does best at points left out; other structures if the likeliest fails.
+        """The law that does best at points left out.
 
-        Under roles the structures were run freely, and the best few of them are compared.
+        Other structures are tried unless the likeliest follows every record that is left out. Under
+        roles the structures were run freely, and the best few of them are compared.
         """
         n = len(self.structures) if self.problem.roles is not None else 1
         found = self._choose(self.structures[:n], law, [])
-        if not found.is_trusted and len(self.structures) > n:
+        if found.runs and found.choice.score > 0.0 and len(self.structures) > n:
             found = self._choose(self.structures[n:], law, found.trials)
         return found
 

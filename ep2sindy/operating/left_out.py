@@ -163,10 +163,16 @@ def follow_together(
     """Laws of one structure, each fitted to windows of all records at once.
 
     Of the functions that may be taken, those of more numbers are tried only while the law does not
-    hold at the records that it was fitted to. start: with the fits of each point alone.
+    hold at the records that it was fitted to. start: with the fits of each point alone, which is
+    returned as it is unless these hold at more than half of the points.
     Raises ValueError if the points do not suffice for any law.
     """
     trials, runs = [], [record.run for record in start.records]
+    if not start.fits.models[0].inputs:
+        pairs = zip(start.fits.models, start.records, strict=True)
+        alone = [run_freely(model, record, start.assessed).holds for model, record in pairs]
+        if 2 * sum(alone) <= len(alone):
+            return [start]
     for functions in start.fits.candidates(law):
         together = follow_windows(start.fits, functions, runs, periods=periods)
         trials.append(replace(start, fits=together, functions=functions))
