@@ -64,6 +64,8 @@ MOST_COMBINED, SIZES, MADE_SIZES = 27, (2, 3, 4), (3, 4, 5, 6)
 
 N_UNDER_ROLES, N_ALIKE = 6, 3  # structures under roles whose laws are compared, and of one size
 
+MOST_FOLLOWED = 20  # windows of each record, on which a law of all points is fitted
+
 FOUND, REFINED = "found", "_refined"  # names of structures, and the end of that of a refinement
 
 
@@ -381,7 +383,8 @@ class _Search:
             raise ValueError(reason)
         if one.windows is not None:
             periods = max(1.0, one.windows.periods or PERIODS)
-            follow = partial(follow_together, law=law, periods=periods)
+            n_windows = min(MOST_FOLLOWED, one.windows.n_windows)
+            follow = partial(follow_together, law=law, n_windows=n_windows, periods=periods)
             refined = [trial for trial in trials if trial.fits.statuses]
             stage = self.progress.stage(len(refined), "structure", "laws over all points")
             trials = [trial for trial in trials if not trial.fits.statuses]

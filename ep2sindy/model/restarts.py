@@ -42,11 +42,13 @@ WORST, SURELY, NOTHING, CLOSE = 10.0, 1.645, 1e-3, 0.05
 class Restarts:
     """A model that is run along a record, driven by its inputs, from any of its samples.
 
-    Samples that were not measured start no run and are compared with none.
+    Samples that were not measured start no run and are compared with none. accurate: largest error
+    of a step between samples, as a fraction of a state's largest sample.
     """
 
     model: Equations
     record: Trajectory
+    accurate: float = ACCURATE
 
     def of(self, model: Equations) -> Restarts:
         """Another model of the same terms along the same record, by the same steps."""
@@ -99,7 +101,7 @@ class Restarts:
             off = step_error(
                 self._field, self.samples[some], self.record.t, self._drive, some, n, self._bound
             )
-            if np.max(np.nan_to_num(off, nan=np.inf) / size, initial=0.0) <= ACCURATE:
+            if np.max(np.nan_to_num(off, nan=np.inf) / size, initial=0.0) <= self.accurate:
                 break
             n *= 2
         return n

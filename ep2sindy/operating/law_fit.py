@@ -18,7 +18,7 @@ from ep2sindy.refinement.refine import with_coef
 from ep2sindy.refinement.windows import dominant_window
 from ep2sindy.regression.constrained import read_coefficients
 
-N_WINDOWS = 20  # of every record
+ACCURATE = 1e-5  # error of a step between samples, as a fraction of the largest one
 
 # Gauss-Newton steps of a law; one that gains less than this fraction of the loss is the last; a
 # step that gains nothing is cut to this fraction, and given up below the last.
@@ -28,7 +28,12 @@ LOST = 1.0  # loss of a window in which a model blows up: a constant's
 
 
 def follow_windows(
-    fits: PointFits, functions: Library, runs: Sequence[Trajectory], *, periods: float
+    fits: PointFits,
+    functions: Library,
+    runs: Sequence[Trajectory],
+    *,
+    n_windows: int,
+    periods: float,
 ) -> PointFits:
     """The fits with the rows by which their law follows windows of all records at once.
 
@@ -40,15 +45,15 @@ def follow_windows(
     in standard deviations of each state at the point, by Gauss-Newton: the starts of windows are
     fitted for every W, and their derivatives eliminated. The rows (R_p, y_p) that are returned are
     linearised at the best W, so that laws without one of the points follow from them, too.
-    fits: of each point alone, with which it begins. runs: one record of each point. periods: in
-    each of the windows.
+    fits: of each point alone, with which it begins. runs: one record of each point. n_windows,
+    periods: number of windows of every record, and their length.
     """
     at = functions.evaluate(fits.columns(functions))
     starts: list[np.ndarray | None] = [None] * len(runs)
     best, law, tried = _Linearised([], np.inf), fits.pool(functions), fits.pool(functions)
     ahead, fraction = law, 1.0
     for _ in range(MOST_STEPS):
-        found = _linearise_all(fits, tried, at, runs, periods, starts)
+        found = _linearise_all(fits, tried, at, runs, (n_windows, periods), starts)
         gain = best.loss - found.loss
         if gain > 0.0:
             best, law, fraction, starts = found, tried, 1.0, [*found.starts]
@@ -80,16 +85,16 @@ def _linearise_all(
     law: Float[np.ndarray, "free functions"],
     at: Float[np.ndarray, "points functions"],
     runs: Sequence[Trajectory],
-    periods: float,
+    windows: tuple[int, float],
     near: Sequence[np.ndarray | None],
 ) -> _Linearised:
-    """near: starts of windows by a law that is near, if one is known."""
+    """windows: their number and periods. near: their starts by a law that is near, if known."""
     rows, losses, starts = [], [], []
     held = fits.relations.at(fits.points)
     for k, (model, constraint, run) in enumerate(zip(fits.models, held, runs, strict=True)):
         z = law @ at[k]
         moved, _ = with_coef(model, constraint, constraint.coef(z))
-        slope, left, loss, own = _linearise(moved, constraint, run, periods, near[k])
+        slope, left, loss, own = _linearise(moved, constraint, run, windows, near[k])
         rows.append((slope, slope @ z - left))
         losses.append(loss)
         starts.append(own)
@@ -100,7 +105,7 @@ def _linearise(
     model: SparseModel,
     held: Constraint,
     run: Trajectory,
-    periods: float,
+    windows: tuple[int, float],
     near: Float[np.ndarray, "windows n_states"] | None,
 ) -> tuple[Float[np.ndarray, "free free"], Float[np.ndarray, " free"], float, np.ndarray]:
     """What windows leave, and its slopes by the free coefficients, starts eliminated.
@@ -108,9 +113,9 @@ def _linearise(
     Both are triangles of a QR decomposition, over the root of the number of residuals; then the
     mean square of what is left, and the starts.
     """
-    along = Restarts(model, run)
+    along, (n_windows, periods) = Restarts(model, run, ACCURATE), windows
     n_ahead = dominant_window([run], model.states, periods=periods) - 1
-    first = along.starts(n_ahead, N_WINDOWS, measured=False)
+    first = along.starts(n_ahead, n_windows, measured=False)
     starts = along.fitted(first, n_ahead) if near is None else along.nearer(first, n_ahead, near)
 
     def off(of: Restarts, moved: Float[np.ndarray, "windows n_states"]) -> np.ndarray:

@@ -20,7 +20,7 @@ from ep2sindy.model.rollout import simulate
 from ep2sindy.model.stability import ATTRACTING_BELOW
 from ep2sindy.operating.interpolation import Interpolation
 from ep2sindy.operating.law import LawFunctions, OperatingLaw, read_law
-from ep2sindy.operating.law_fit import follow_windows
+from ep2sindy.operating.law_fit import ACCURATE, follow_windows
 from ep2sindy.operating.point_fits import PointFits, usual_functions
 from ep2sindy.operating.quiet import SMALL, QuietPoint
 from ep2sindy.operating.records import OperatingRecord
@@ -70,8 +70,8 @@ class LeftOutRun:
     def deviation(self) -> float:
         """Largest error in units of its bound; zero of a run that follows the samples.
 
-        At most it is WORST, that of a run that fails: one that does not hold has to attract, since
-        a neutral cycle keeps the amplitude of its start.
+        At most it is WORST, that of a run that fails: a cycle has to attract, since a neutral one
+        keeps the amplitude of its start.
         """
         run, bounds = self.run, self.run.bounds
         if run.status is Status.FOLLOWS:
@@ -81,9 +81,8 @@ class LeftOutRun:
             self.amplitude_error / bounds.amplitude,
             self.waveform_error / bounds.waveform,
         )
-        if not np.isfinite(errors).all() or not (run.holds or run.multiplier < ATTRACTING_BELOW):
-            return 0.0 if run.holds else WORST
-        return min(max(errors), WORST)
+        known = np.isfinite(errors).all() and run.multiplier < ATTRACTING_BELOW
+        return min(max(errors), WORST) if known else WORST
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,13 +125,13 @@ class LawTrial:
 
     @cached_property
     def held(self) -> float:
-        """Part of the records that the law was fitted to at which it holds, no more than HOLDS.
+        """Part of the records that the law was fitted to on which it stays, no more than HOLDS.
 
         It is not asked of a model that inputs drive.
         """
         if self.fits.models[0].inputs:
             return HOLDS
-        return min(HOLDS, sum(run.holds for run in self.fitted) / len(self.records))
+        return min(HOLDS, sum(map(_stays, self.fitted)) / len(self.records))
 
     @cached_property
     def left_out(self) -> list[LeftOutRun]:
@@ -158,7 +157,11 @@ class LawTrial:
 
 
 def follow_together(
-    start: LawTrial, law: LawFunctions | Sequence[LawFunctions], *, periods: float
+    start: LawTrial,
+    law: LawFunctions | Sequence[LawFunctions],
+    *,
+    n_windows: int,
+    periods: float,
 ) -> list[LawTrial]:
     """Laws of one structure, each fitted to windows of all records at once.
 
@@ -170,11 +173,11 @@ def follow_together(
     trials, runs = [], [record.run for record in start.records]
     if not start.fits.models[0].inputs:
         pairs = zip(start.fits.models, start.records, strict=True)
-        alone = [run_freely(model, record, start.assessed).holds for model, record in pairs]
+        alone = [_stays(run_freely(model, record, start.assessed)) for model, record in pairs]
         if 2 * sum(alone) <= len(alone):
             return [start]
     for functions in start.fits.candidates(law):
-        together = follow_windows(start.fits, functions, runs, periods=periods)
+        together = follow_windows(start.fits, functions, runs, n_windows=n_windows, periods=periods)
         trials.append(replace(start, fits=together, functions=functions))
         if trials[-1].held == HOLDS:
             break
@@ -226,7 +229,7 @@ def window_errors(
     n_ahead = dominant_window([run], models[0].states, periods=periods) - 1
     found = []
     for model in models:
-        along = Restarts(model, run)
+        along = Restarts(model, run, ACCURATE)
         first = along.starts(n_ahead, N_WINDOWS, measured=False)
         paths = along.paths(along.fitted(first, n_ahead), first, n_ahead)
         squares = np.nanmean(np.square(along.off(paths, first)), axis=(1, 2))
@@ -248,6 +251,14 @@ def run_freely(
     columns = [record.run.state_names.index(state) for state in model.states]
     start = cycle.waveform(cycle.phase[[k]])[0][columns]
     return evaluate(model, record.from_slowest, initial=start, assessed=assessed)
+
+
+def _stays(run: Evaluation) -> bool:
+    """Whether a run follows the record, or stays on its cycle for as long as it was recorded.
+
+    Whether that cycle attracts takes longer to find out, and is asked of runs at points left out.
+    """
+    return run.comparison.stays or run.status is Status.FOLLOWS
 
 
 def _rests(law: OperatingLaw, point: QuietPoint) -> bool:

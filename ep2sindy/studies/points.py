@@ -34,6 +34,7 @@ from ep2sindy.runtime.parallel import Workers, collect
 from ep2sindy.signals.embedding import Embedded, embed_alike
 from ep2sindy.signals.signal import prepare_signal
 from ep2sindy.signals.spectrum import Oscillation
+from ep2sindy.studies.point_processes import add_processes
 from ep2sindy.studies.point_sources import (
     Functions,
     GivenPoints,
@@ -276,6 +277,9 @@ class Study:
         if choice is not None:
             others = "other models or models=null" if self.models else "another ++degree=..."
             of_law = add_law(report, found, points, self.labels, others)
+            if choice.choice.fits.relations.common.processes:
+                zones = {point.label: point.zones for point in opened}
+                add_processes(report, choice, zones, self.labels)
             more = [Text(choice.text)] if choice.text else []
             shown = replace(shown, blocks=[*shown.blocks, *more]) if shown else of_law
         assert shown is not None
