@@ -133,6 +133,11 @@ class LawTrial:
             return HOLDS
         return min(HOLDS, sum(map(_stays, self.fitted)) / len(self.records))
 
+    @property
+    def is_sustained(self) -> bool:
+        """Whether the law holds at most of its records, where its cycles have to attract, too."""
+        return sum(run.holds for run in self.fitted) >= HOLDS * len(self.records)
+
     @cached_property
     def left_out(self) -> list[LeftOutRun]:
         """Every record run freely with the law of the others."""
@@ -377,7 +382,8 @@ def choose_law(trials: Sequence[LawTrial]) -> LawChoice:
         place = fewest_of_least([(trial.errors, trial.n_numbers) for trial in tested])
         return LawChoice(trials, tested[place], [], between)
     most = max(trial.held for trial in tested)
-    best = min((t for t in tested if t.held == most), key=lambda t: (t.score, t.error))
+    stay = [trial for trial in tested if trial.held == most]
+    best = min(stay, key=lambda trial: (not trial.is_sustained, trial.score, trial.error))
     return LawChoice(trials, best, _beside(best.left_out, between), between)
 
 

@@ -6,7 +6,8 @@ import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 import xarray as xr
@@ -25,6 +26,7 @@ from ep2sindy.regression.bootstraps import Bootstraps
 from ep2sindy.regression.rows import Formulation
 from ep2sindy.report.document import Text
 from ep2sindy.report.report import Report
+from ep2sindy.runtime.parallel import SURROUNDING, Workers
 from ep2sindy.runtime.progress import Progress, count_pieces
 from ep2sindy.selection.criteria import Knee
 from ep2sindy.signals.attractor import find_cycle
@@ -41,6 +43,7 @@ from ep2sindy.studies.library_result import (
     refit,
     refitted_model,
 )
+from ep2sindy.studies.point_sources import Points
 from ep2sindy.studies.processes import NO_ZONES, Zones
 from ep2sindy.studies.source import Source, columns_beside, n_before, split_in_time, zones_of
 from ep2sindy.studies.study import Coefficients, Fraction, PositiveOrAll, Terms, ZeroOrMore
@@ -52,6 +55,9 @@ from ep2sindy.studies.sustained import (
 )
 from ep2sindy.studies.views import PlotRange, add_figures, add_samples
 from ep2sindy.trust.user_code import load_user_module
+
+if TYPE_CHECKING:
+    from ep2sindy.studies.points import Study as OverPoints
 
 FIGURES = ("data", "trajectories", "derivatives", "phase")
 HELD_OUT = 0.25  # fraction of a record that tests self-sustained models, unless a config says
@@ -111,9 +117,11 @@ class Study:
     every library that are no states. period_s: of a drive that is known by its period, which
     becomes the inputs `cos_drive` and `sin_drive` of every library. hidden: states that nobody
     measured, relations between coefficients, terms that an equation may not have (exclude), roles,
-    and means over samples (decimate), as for `discover`. Raises ValueError for hidden states with
-    several libraries or with a search for a self-sustained model, which needs samples of all
-    states.
+    and means over samples (decimate), as for `discover`. points: operating points, for which one
+    self-sustained model is searched whose coefficients are functions of the point, and nothing
+    else; parameters: their places in the data group; labels: their names in figures. Raises
+    ValueError for hidden states with several libraries or with a search for a self-sustained model,
+    which needs samples of all states.
     """
 
     source: Source
@@ -134,8 +142,13 @@ class Study:
     exclude: Terms | None = None
     roles: Roles | None = None
     decimate: int | str | None = None
+    points: Points | None = None
+    parameters: Mapping[str, str | None] = field(default_factory=dict)
+    labels: Mapping[str, str] = field(default_factory=dict)
+    parallel: Workers = SURROUNDING
 
     def __post_init__(self) -> None:
+        _ = self._over_points
         if self.hidden and (self.sustained is not None or len(self.libraries) > 1):
             raise ValueError(
                 "hidden states go with one library and sustained=none, got "
@@ -148,7 +161,24 @@ class Study:
                 f"exclude={dict(self.exclude)}; take +exp=discover"
             )
 
+    @cached_property
+    def _over_points(self) -> OverPoints | None:
+        """The study of operating points; None without any."""
+        if self.points is None:
+            return None
+        # This loads torch, only for operating points.
+        from ep2sindy.studies.points import MAP_POINTS
+        from ep2sindy.studies.points import Study as OverPoints
+
+        return OverPoints(
+            self.source, self.formulation, self.parallel, self.points, self.parameters,
+            sustained=self.sustained, labels=self.labels, map_points=MAP_POINTS,
+        )  # fmt: skip
+
     def run(self, report: Report) -> None:
+        if self._over_points is not None:
+            self._over_points.run(report)
+            return
         with report.watch.stage(None, "", "data"):
             fields = self.source.fields()
         cases = self._served_by(fields[0], report)

@@ -62,6 +62,8 @@ from ep2sindy.studies.sustained import SustainedSearch
 
 EXACT = 1e-3  # part of a known value that may be left, as where a record's balance is averaged
 
+MAP_POINTS = 13  # along each parameter of a map, where a config does not say
+
 N_TOGETHER = 24  # points of a map computed as one piece: the records are sent with each piece
 
 
@@ -243,7 +245,12 @@ class Study:
         inflow = dict(roles.inflow)
         for state in roles.inflow:
             name = f"{state} in"
-            if name in roles.open and all(name in rates for _, rates in known):
+            if name in roles.open and not all(name in rates for _, rates in known):
+                report.say(
+                    f"the inflow of {state} is free: densities alone hardly tell how much passes "
+                    f"through, so state it if you can, sustained.roles.inflow.{state}=NUMBER in SI"
+                )
+            elif name in roles.open:
                 values = np.array([rates[name].terms["1"] for _, rates in known])
                 inflow[state] = functions_through(values, [point for point, _ in known])
                 words = " + ".join(f"{v:.4g} {f}" for f, v in inflow[state].items())
