@@ -150,7 +150,7 @@ def test_own_files_and_points_that_do_not_oscillate(tmp_path: Path) -> None:
     found.check_figures("trends_free", "trends_constrained")
     assert np.isnan(found.report.headline["free/L_m/search_error"])
     (warning,) = [text for text in found.warnings if "no law of whole models" in text]
-    assert "2 points that oscillate get no law" in warning
+    assert "'mdot_mg_s' is 5 at all 2 operating points" in warning
 
 
 def test_nothing_that_oscillates_is_a_result(tmp_path: Path) -> None:

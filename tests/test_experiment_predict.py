@@ -30,8 +30,8 @@ def toy(output: Path) -> list[str]:
     return [
         f"output={output}", f"data.cache={output / 'cache'}", "data.duration_s=2.0e-3",
         "data.warm_up_s=1.0e-3", "data.n_cells=30", "parallel=serial", "law=1",
-        "windows={n_windows: 4, periods: 1.0}", "map_points=2", "~models.free", "~models.inflow",
-        "~models.leaving",
+        "windows={n_windows: 4, periods: 1.0}", "map_points=2",
+        "sustained.search={max_terms: 5, n_best: 100}", "sustained.depth=1",
     ]  # fmt: skip
 
 
@@ -44,22 +44,21 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_run_leaves_a_law_tables_figures_and_a_summary(folder: Path) -> None:
     summary = summary_of(folder)
     law, headline = summary["law"], summary["headline"]
-    trials = {trial["fit"]: trial for trial in summary["trials"]}
-    assert set(trials) == {"conserving", "conserving_refined"}
-    assert law["fit"] == min(trials, key=lambda fit: trials[fit]["error"])
-    chosen = trials[law["fit"]]
-    assert chosen["chosen"]
+    names = {trial["fit"] for trial in summary["trials"]}
+    (chosen,) = [trial for trial in summary["trials"] if trial["chosen"]]
+    assert chosen["fit"] == law["fit"]
     assert law["cycle"] == "all"
-    assert law["exact"][0] == "n_i: n_n == -1 * n_n: n_n"
-    assert law["exact"][3] == "n_n: 1 == 4.58e+22 * mdot_mg_s"
-    assert (chosen["functions"], chosen["numbers"]) == ("1, V_D_V, mdot_mg_s", 15)
+    (exact,) = law["exact"]
+    known, _, parameter = exact.removeprefix("n_n: 1 == ").partition(" * ")
+    assert parameter == "mdot_mg_s"
+    assert float(known) == pytest.approx(4.61e22, rel=0.05)
+    assert chosen["functions"] == "1, V_D_V, mdot_mg_s"
     assert set(summary["models"]) == {
-        *(f"point_{k}_{fit}" for k in range(4) for fit in (*trials, "law"))
+        *(f"point_{k}_{fit}" for k in range(4) for fit in (*names, "law"))
     }
     quiet = [p for p in summary["points"] if p["status"] != "oscillating"]
     assert [(p["V_D_V"], p["mdot_mg_s"]) for p in quiet] == [(150.0, 2.0)]
     tables = {path.stem: pd.read_csv(path) for path in (folder / "tables").glob("*.csv")}
-    assert len(tables["laws"]) == 27
     assert len(tables["left_out"]) == 4
     assert len(tables["map"]) == 4
     assert headline["n_sustained"] == (tables["left_out"]["status"] == "sustained").sum()
@@ -67,13 +66,15 @@ def test_the_run_leaves_a_law_tables_figures_and_a_summary(folder: Path) -> None
     points = tables["points"]
     oscillating = points["status"] == "oscillating"
     assert headline["n_fitted_sustained"] == (points["law"][oscillating] == "sustained").sum()
-    assert points["law"][oscillating].tolist().count("wrong cycle") == 2  # cycles, of another size
-    assert headline["n_rests"] == 0
+    rates = tables["processes"].set_index(["process", "V_D_V", "mdot_mg_s"])
+    assert {"neutrals that enter", "ions that leave"} <= set(rates.index.levels[0])
+    supplied = rates["ratio"]["neutrals that enter"].to_numpy()
+    np.testing.assert_allclose(supplied, 1.0, atol=0.02)
     alone = tables["coefficients"].set_index(["model", "state", "term"])["coef"]
     both = tables["law_coefficients"].set_index(["V_D_V", "mdot_mg_s", "state", "term"])
-    at = (*points.loc[1, ["V_D_V", "mdot_mg_s"]], "n_i", "n_n")
-    assert both["law"][at] == alone["point_1_law", "n_i", "n_n"]
-    assert both["alone"][at] == alone[f"point_1_{law['fit']}", "n_i", "n_n"]
+    at = (*points.loc[1, ["V_D_V", "mdot_mg_s"]], "n_i", "n_i")
+    assert both["law"][at] == alone["point_1_law", "n_i", "n_i"]
+    assert both["alone"][at] == alone[f"point_1_{law['fit']}", "n_i", "n_i"]
 
 
 @pytest.mark.slow
@@ -94,8 +95,9 @@ def test_the_law_of_a_run_gives_models_in_python(folder: Path) -> None:
     assert law.parameters == ("V_D_V", "mdot_mg_s")
     model = law.at(V_D_V=310.0, mdot_mg_s=5.2)
     n_i, n_n = model.terms("n_i"), model.terms("n_n")
-    assert [n_n[term] for term in n_i if term != "n_i"] == [-n_i[t] for t in n_i if t != "n_i"]
-    assert n_n["1"] == 4.58e22 * 5.2
+    exchanged = [term for term in n_i if term in n_n and "n_n" in term]
+    assert [n_n[term] for term in exchanged] == [-n_i[term] for term in exchanged]
+    assert n_n["1"] == pytest.approx(4.61e22 * 5.2, rel=0.05)
     with pytest.raises(ValueError, match="outside the points"):
         law.at(V_D_V=150.0, mdot_mg_s=2.0)
 
@@ -130,8 +132,8 @@ def own_records(folder: Path, *values: float) -> list[str]:
         f"output={folder}", "data=file", "data.path=null", "data.z.name=null",
         "trajectory.zone.z=null", "data.variables.n_i.name=p", "data.variables.n_n.name=q",
         "~parameters.V_D_V", "~parameters.mdot_mg_s", "+parameters.a=null",
-        f"points=[{','.join(points)}]", "~models",
-        "+models.own.terms={n_i: [n_i,n_n,'n_i^3'], n_n: [n_i]}",
+        f"points=[{','.join(points)}]", "sustained=none",
+        "models={own: {terms: {n_i: [n_i,n_n,'n_i^3'], n_n: [n_i]}}}",
         "law=1", "windows={n_windows: 4, periods: 2.0}", "map_points=2", "parallel=serial",
     ]  # fmt: skip
 
@@ -143,10 +145,12 @@ def test_points_that_are_quiet_have_no_law(tmp_path: Path) -> None:
 
 
 def test_own_records_make_a_law_of_the_model_that_is_chosen_and_its_line(tmp_path: Path) -> None:
-    held = "+models.held={terms: {n_i: [n_i,n_n,'n_i^3'], n_n: [n_i]}, known: {n_n: {n_i: {1: 1}}}}"
+    held = (
+        "++models.held={terms: {n_i: [n_i,n_n,'n_i^3'], n_n: [n_i]}, known: {n_n: {n_i: {1: 1}}}}"
+    )
     found = programs.computed(composed(*own_records(tmp_path, 0.6, 0.9, 1.2), held))
     table = found.report.tables["trials"]
-    assert table["fit"][table["chosen"]].item().startswith("held")
+    assert table["fit"][table["chosen"]].item().endswith("_refined")
     assert table["fit"].tolist() == ["own", "own_refined", "held", "held_refined"]
     assert table["numbers"].tolist() == [8, 8, 6, 6]
     law = OperatingLaw.load(found.folder / "law.json")
@@ -158,9 +162,9 @@ def test_own_records_make_a_law_of_the_model_that_is_chosen_and_its_line(tmp_pat
 
 def test_without_a_model_the_terms_are_searched_for(tmp_path: Path) -> None:
     records = own_records(tmp_path, 0.6, 0.9, 1.2)
-    found = programs.computed(composed(*records, "models=null", "+degree=3", "map_points=1"))
+    found = programs.computed(composed(*records, "models=null", "++degree=3", "map_points=1"))
     names = [trial["fit"] for trial in found.summary["trials"]]
-    assert names == ["found_1", "found_1_refined", "found_2", "found_2_refined"]
+    assert names == ["found_1", "found_1_refined"]  # which follows the records, so that no other is
     terms = found.summary["models"]["point_0_law"]["equations"]
     # x' = y is the best of few terms, and of all.
     assert {state: set(own) for state, own in terms.items()} == {
@@ -182,8 +186,8 @@ def test_what_rests_is_counted_apart_and_what_went_out_is_not(tmp_path: Path) ->
     assert rests == "rests"
     numbers = found.report.headline
     assert [numbers[f"n_{k}"] for k in ("points", "fitted_sustained", "rests")] == [5, 3, 1]
-    says = "sustains 3 of the 3 it was fitted to, and rests at 1 of 1 whose record is steady or"
-    assert f"{says} decays; not counted: out." in " ".join(found.log.split())
+    says = "holds at 3 of the 3 it was fitted to, and rests at 1 of 1 whose record is quiet"
+    assert f"{says}; not counted: out." in " ".join(found.log.split())
 
 
 def test_a_search_that_fails_is_not_told_to_search(tmp_path: Path) -> None:
@@ -191,11 +195,11 @@ def test_a_search_that_fails_is_not_told_to_search(tmp_path: Path) -> None:
     for path in tmp_path.glob("*.csv"):  # pulses, which no linear model has
         table = pd.read_csv(path, index_col="time")
         table.assign(p=table["p"] ** 3).to_csv(path)
-    found = programs.computed(composed(*records, "models=null", "+degree=1"))
+    found = programs.computed(composed(*records, "models=null", "++degree=1"))
     (warning,) = [each for each in found.warnings if "of 3 points left out" in each]
     assert "or another ++degree=" in warning
     assert "models=null" not in warning
-    assert "Nothing found: found_" in found.log
+    assert "the law holds at 0 of 1 points left out" in found.log
 
 
 def test_of_two_cycles_the_law_is_that_of_the_one_with_most_records(tmp_path: Path) -> None:
@@ -227,7 +231,7 @@ def known_records(folder: Path, system: str) -> list[str]:
     return [
         "data=recognised", "data.path=null", f"points.files='{folder}/{pattern}.csv'",
         f"trajectory.states=[{','.join(law)}]", "trajectory.zone=null",
-        "~models", f"+models.own.terms={{{terms}}}", f"output={folder}/outputs",
+        f"models={{own: {{terms: {{{terms}}}}}}}", f"output={folder}/outputs",
         "parallel=serial", "keep=false",
     ]  # fmt: skip
 
@@ -238,8 +242,8 @@ def known_records(folder: Path, system: str) -> list[str]:
 def test_the_law_of_known_records_is_headlined(
     experiment: str, system: str, tmp_path: Path
 ) -> None:
-    own = {"parametric": "thesis=null", "predict": "map_points=2"}[experiment]
-    settings = [*known_records(tmp_path, system), own]
+    own = {"parametric": ["thesis=null"], "predict": ["map_points=2", "sustained=none"]}
+    settings = [*known_records(tmp_path, system), *own[experiment]]
     found = programs.computed(programs.composed(f"+exp={experiment}", *settings))
     summary = found.summary["law"]
     # Rows have the bias of smoothing: the refined coefficients are right.

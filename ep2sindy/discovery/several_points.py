@@ -115,7 +115,9 @@ def discover_together(
     records = {k: OperatingRecord(runs[0]) for k, runs in given.items() if k not in aside}
     repeat = bool(records) and all(record.repeats for record in records.values())
     points = {k: runs for k, runs in given.items() if not (repeat and k in aside)}
-    problem = PointsProblem(asked, points, method, law, workers, quiet if repeat else [])
+    if not repeat or {*asked.library.variables} - {*asked.states}:
+        quiet = []  # what rests under inputs depends on theirs
+    problem = PointsProblem(asked, points, method, law, workers, quiet)
     found = problem.discover(rng=rng, progress=progress)
     choice = found.law_choice
     if choice is None or choice.choice.held == HOLDS or not repeat:

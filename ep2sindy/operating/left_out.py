@@ -336,7 +336,7 @@ class LawChoice:
         n, n_held = len(self.inside), sum(run.run.holds for run in self.inside)
         where = "points left out" if self.inside[0].inside else "points beyond the others"
         if self.is_trusted:
-            return f"it holds at {n_held} of {n} {where}"
+            return f"holds at {n_held} of {n} {where}"
         if self.interpolation is None or not self.inside[0].inside:
             return f"no law holds at {where}: {n_held} of {n}"
         return f"interpolate: the law holds at {n_held} of {n} {where}"

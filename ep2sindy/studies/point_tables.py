@@ -216,13 +216,12 @@ def add_law(
     report.samples("law_coefficients", alone)
     draw = partial(laws_figure, alone, law, parameters=parameters, labels=labels)
     report.figure("laws", draw, CAPTIONS["laws"])
-    shown, head = [], f"Found: a law of {choice.name} over {', '.join(law.parameters)}"
+    shown, head = [], f"Law of {choice.name} over {', '.join(law.parameters)}"
     if taken.text:
         shown.append(Text(taken.text))
     if taken.runs:
-        head = f"Found: a law of {choice.name}; {taken.heading}"
-        if not taken.is_trusted:
-            head = taken.heading[0].upper() + taken.heading[1:]
+        heading = taken.heading
+        head = f"Law of {choice.name}: {heading}" if taken.is_trusted else heading.capitalize()
         _add_left_out(report, taken, remedy)
         shown.append(Text(_add_map(report, found, points, labels)))
     report.section("Structures and laws compared")

@@ -28,7 +28,7 @@ from ep2sindy.operating.quantities import Quantity
 from ep2sindy.operating.records import Point, read_points
 from ep2sindy.refinement.problem import RefinementSettings
 from ep2sindy.regression.rows import Formulation
-from ep2sindy.report.document import Text
+from ep2sindy.report.document import Result, Text
 from ep2sindy.report.report import Report
 from ep2sindy.runtime.parallel import Workers, collect
 from ep2sindy.signals.embedding import Embedded, embed_alike
@@ -161,6 +161,8 @@ class Study:
             if Oscillation.OSCILLATING not in statuses:
                 if self._has_quantities:
                     report.table("points", points_table(opened))
+                    n = len(opened)
+                    report.found(Result(f"No control laws: none of {n} points oscillates", []))
                     return
                 raise ValueError(nothing_moves(statuses))
             libraries = self._libraries or {"": self._library(opened, signal, report)}
@@ -168,6 +170,9 @@ class Study:
                 name: self._discover(runs, library, workers, report)
                 for name, library in libraries.items()
             }
+            warnings = [text for own in by_model.values() for text in own.data_warnings]
+            for text in dict.fromkeys(warnings):
+                report.warn(text)
             found = self._join(by_model, opened)
             if found.choice is not None:
                 maps = self._map(found.choice, opened, workers, report)
@@ -196,16 +201,13 @@ class Study:
             progress=report.watch,
         )  # fmt: skip
         try:
-            found = find(law=search)
+            return find(law=search)
         except ValueError as error:
             if not self._has_quantities:
                 raise
-            report.warn(f"no law of whole models: {error}")
             constants = replace(search, functions=named_terms(self._given.names, ["1"]))
-            found = replace(find(law=constants), law=None)
-        for warning in found.data_warnings:
-            report.warn(warning)
-        return found
+            found, reason = find(law=constants), f"no law of whole models: {error}"
+            return replace(found, law=None, data_warnings=(*found.data_warnings, reason))
 
     def _join(
         self, by_model: Mapping[str, Discovery], opened: Sequence[OpenedPoint]
