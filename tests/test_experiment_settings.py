@@ -14,6 +14,7 @@ from tests.test_pages import TOYS
 TWICE = "points=[{V_D_V: 300, mdot_mg_s: 5},{V_D_V: 300, mdot_mg_s: 5, data: {n_cells: 40}}]"
 ALIKE = "points=[{V_D_V: 1, mdot_mg_s: 5},{V_D_V: 2, mdot_mg_s: 5}]"
 FEW = "{V_D_V: 300, mdot_mg_s: [4, 5]}, {V_D_V: 310, mdot_mg_s: 4}"
+HELD = "models={own: {terms: {n_i: [n_i,n_n], n_n: [n_i]}, relations: ['n_i: n_i == n_n: n_n']}}"
 STRAIGHT = ", ".join(f"{{V_D_V: {300 + 10 * k}, mdot_mg_s: {4 + k}}}" for k in range(4))
 
 
@@ -32,7 +33,12 @@ STRAIGHT = ", ".join(f"{{V_D_V: {300 + 10 * k}, mdot_mg_s: {4 + k}}}" for k in r
         ("parametric", ["models.free.quantities.L_m.power=3"], "the power 1 or -1"),
         ("pointwise", ["terms=[n_i-n_n]"], "a term is variables joined by *"),
         ("pointwise", ["bootstraps.block=100000"], "no point could be fitted: a block must hold"),
-        ("predict", ["models.conserving.terms.n_i=[n_i,u_iz]"], "conserving cannot hold: relation"),
+        ("predict", [HELD], "models.own cannot hold: relation"),
+        (
+            "predict",
+            ["trajectory.states=[n_i,T_e_eV]"],
+            "take sustained=none for terms of any kind",
+        ),
         ("predict", [f"points=[{FEW}]"], "a law of 3 functions of ['V_D_V', 'mdot_mg_s'] needs m"),
         ("predict", [f"points=[{STRAIGHT}]"], "4 points do not tell the 3 terms of a law apart"),
         ("weak", ["fits.boxes.form=box"], "fits.boxes.form must be null, balance or one of ['boxe"),

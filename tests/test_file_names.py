@@ -132,8 +132,8 @@ def swing(folder: Path, *values: float) -> None:
 def predicted(folder: Path, terms: str, *more: str) -> Computed:
     return computed(
         composed(
-            "+exp=predict", "data=recognised", mend("points.files=a{a}.csv"), "~models",
-            f"+models.own.terms={terms}", "law=1", "windows={n_windows: 4, periods: 2.0}",
+            "+exp=predict", "data=recognised", mend("points.files=a{a}.csv"),
+            f"models={{own: {{terms: {terms}}}}}", "law=1", "windows={n_windows: 4, periods: 2.0}",
             "map_points=2", "parallel=serial", f"output={folder}",
             *more,
         )
@@ -144,7 +144,7 @@ def test_files_make_a_law_over_the_quantity_of_their_names(here: Path) -> None:
     swing(here, 0.6, 0.9, 1.2)
     touch("aold.csv")
     found = predicted(
-        here, "{n_i: [n_i,n_n,'n_i^3'], n_n: [n_i]}", "+models.own.known={n_n:{n_i:{1:1.0}}}"
+        here, "{n_i: [n_i,n_n,'n_i^3'], n_n: [n_i]}", "++models.own.known={n_n:{n_i:{1:1.0}}}"
     )
     assert found.report.tables["points"]["a"].tolist() == [0.6, 0.9, 1.2]
     law = OperatingLaw.load(found.folder / "law.json")
@@ -172,12 +172,12 @@ def test_one_signal_at_every_point_is_predicted(here: Path, capsys: pytest.Captu
     typed = shlex.split(line)
     assert typed[:3] == ["+exp=predict", "data=recognised", "points.files=tek{V}V.csv"]
     assert typed[3:] == ["trajectory.states=[Ibeam]"]
-    study = study_of(Study, composed(*map(mend, [*typed, "~models", OWN])))
+    study = study_of(Study, composed(*map(mend, [*typed, OWN])))
     runs = [source.open([]).run for source in study._given.sources]
     assert [run.parameters["V"] for run in runs if run] == [200.0, 250.0, 300.0]
 
 
-OWN = "+models={own: {terms: {Ibeam: ['1']}}}"
+OWN = "models={own: {terms: {Ibeam: ['1']}}}"
 T = np.linspace(0.0, 1.0, 60)
 
 
@@ -193,7 +193,7 @@ def test_files_that_state_their_points_are_points(
     assert typed[2:] == [
         "points.files=shot_*.csv", "+parameters={V_d:null}", "trajectory.states=[Ibeam]",
     ]  # fmt: skip
-    study = study_of(Study, composed(*map(mend, [*typed, "~models", OWN])))
+    study = study_of(Study, composed(*map(mend, [*typed, OWN])))
     points = [dict(source.parameters) for source in study._given.sources]
     assert points == [{"V_d": 200.0}, {"V_d": 250.0}, {"V_d": 300.0}]
 

@@ -16,7 +16,7 @@ from tests.programs import composed
 
 T, KV = np.linspace(0.0, 1.0, 50), np.array([0.2, 0.25, 0.3])
 WAVES = 2.0 + np.sin(9.0 * T + 1e1 * KV[:, None])
-ONE_STATE = ["~models", "+models={own: {terms: {x: ['1']}}}", "trajectory.states=[x]"]
+ONE_STATE = ["models={own: {terms: {x: ['1']}}}", "trajectory.states=[x]"]
 
 
 def write_files() -> None:

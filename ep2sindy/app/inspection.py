@@ -166,8 +166,11 @@ def point_commands(
     if not found.lacking(NEEDS["parametric"]):
         lines.append(["+exp=parametric", *data, "thesis=null", *given])
     signals = signals_of(found, [*NOT_STATES, *inputs])
-    states = ",".join(signals[:1] if "I_d" in signals else signals or found.signals)
-    return lines or [["+exp=predict", *data, f"trajectory.states=[{states}]"]] * bool(states)
+    states = signals[:1] if "I_d" in signals else signals or list(found.signals)
+    if lines or not states:
+        return lines
+    anything = ["sustained=none"] * (len(states) > 1)  # no roles of densities
+    return [["+exp=predict", *data, f"trajectory.states=[{','.join(states)}]", *anything]]
 
 
 def signals_of(found: Inspection, inputs: Sequence[str]) -> list[str]:

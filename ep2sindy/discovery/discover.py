@@ -54,9 +54,10 @@ def discover(
 
     Runs whose `parameters` differ come from several operating points. Each point is then searched
     independently, by the workers, and `points` of the result holds what was found there. `shared`
-    and `law` connect the points. Supports of several points are found by rows (`search_shared`), or
-    under roles at the most central point; a `TrajectorySearch` then refines the coefficients of
-    every point on its trajectories.
+    and `law` connect the points: structures are found for all of them, by rows, and under roles by
+    free runs at every point as well; a `TrajectorySearch` then refines the coefficients of every
+    point on its trajectories. A law is fitted to windows of all records at once, and rests where a
+    record is quiet. `law_choice` of the result holds its runs at points left out.
 
     Parameters
     ----------
@@ -69,11 +70,11 @@ def discover(
         hidden states up to degree 2.
     method : DiscoveryMethod, optional
         None takes `TrajectorySearch()`, the best method that we know for noisy data.
-    law : int, Library, "auto" or list of these, optional
-        Finds one support whose coefficients are functions of the parameters: polynomials of this
+    law : int, Library, "auto", list of these or LawSearch, optional
+        Finds one structure whose coefficients are functions of the parameters: polynomials of this
         degree; those of a library such as `ep.named_terms(["V"], ["1", "1/V"])`; or with "auto"
         those, made of each parameter p, p^2 and 1/p, whose law errs least at points left out. From
-        a list one is chosen.
+        a list one is chosen. `ep.discovery.LawSearch` sets the windows of the refinements, too.
     shared : bool, default False
         True finds one support for all points, with separate coefficients at each.
     hidden : sequence of str or int, default ()

@@ -193,13 +193,16 @@ class Discovery:
     def verdict(self) -> str:
         """What is said of the model, in a few words; see `Evaluation.heading`.
 
-        Of several points, at how many of them what is said; by the law, if there is one.
+        Of several points, at how many of them what is said; by the law, if there is one, unless the
+        records are better interpolated.
         """
         if not self.points:
             return self.judged if self.evaluation is None else self.evaluation.heading
-        found = [own.evaluation for own in self.points.values()]
-        if self.law_choice is not None:
-            found = [*self.law_choice.fitted]
+        found, choice = [own.evaluation for own in self.points.values()], self.law_choice
+        if choice is not None:
+            if choice.runs and not choice.is_trusted:
+                return choice.heading
+            found = [*choice.fitted]
         words = Counter(_said(each) for each in found if each is not None)
         counts = ", ".join(f"{word} at {n}" for word, n in words.most_common() if word)
         return f"{counts} of {len(self.points)}" if counts else self.judged

@@ -86,7 +86,7 @@ class LawSearch:
     Examples
     --------
     >>> windows = ep.refinement.RefinementSettings(n_windows=20, periods=4.0)
-    >>> ep.operating.LawSearch(1, windows).functions
+    >>> ep.discovery.LawSearch(1, windows).functions
     1
     """
 

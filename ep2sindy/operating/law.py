@@ -245,6 +245,23 @@ class OperatingLaw:
         lost = (np.abs(self.coef @ at_points.T) < reach).mean(axis=1) > 0.5
         return [pair for pair, is_lost in zip(self.coefficients, lost, strict=True) if is_lost]
 
+    @property
+    def doubt(self) -> str:
+        """That the points determine the numbers of the law poorly, in words; empty if they do not.
+
+        So it is without points to spare, and with coefficients that are `undetermined`.
+        """
+        counts = f"{self.coef.size} numbers of {len(self.points)} points"
+        if self.covariance is None and len(self.points) <= len(self.functions):
+            return f"{counts}: none is left over to tell how well they are determined"
+        lost = [f"{state}: {term}" for state, term in self.undetermined]
+        if not lost:
+            return ""
+        return (
+            f"{counts}: of {len(self.coef)} coefficients, {len(lost)} are not told from zero, "
+            f"{', '.join(lost)}; leave terms out, or add points"
+        )
+
     def text(self, *, digits: int = 3) -> str:
         """One line per coefficient: `n_i: n_n = 4.83e+03 + 12.1 V_d`.
 
@@ -265,14 +282,7 @@ class OperatingLaw:
                 f"{100.0 * np.median(self.left_out):.2g} % in the median, "
                 f"{100.0 * self.left_out.max():.2g} % at most"
             )
-        counts = f"{self.coef.size} numbers of {len(self.points)} points"
-        if self.covariance is None and len(self.points) <= len(self.functions):
-            lines.append(f"{counts}: none is left over to tell how well they are determined")
-        if lost := [f"{state}: {term}" for state, term in self.undetermined]:
-            lines.append(
-                f"{counts}: of {len(self.coef)} coefficients, {len(lost)} are not told from zero, "
-                f"{', '.join(lost)}; leave terms out, or add points"
-            )
+        lines += [self.doubt] if self.doubt else []
         return "\n".join(lines)
 
     def __repr__(self) -> str:

@@ -217,8 +217,7 @@ def add_law(
     draw = partial(laws_figure, alone, law, parameters=parameters, labels=labels)
     report.figure("laws", draw, CAPTIONS["laws"])
     shown, head = [], f"Law of {choice.name} over {', '.join(law.parameters)}"
-    if taken.text:
-        shown.append(Text(taken.text))
+    shown += [Text(text) for text in (taken.text, law.doubt) if text]
     if taken.runs:
         heading = taken.heading
         head = f"Law of {choice.name}: {heading}" if taken.is_trusted else heading.capitalize()
@@ -227,11 +226,12 @@ def add_law(
     report.section("Structures and laws compared")
     bold = [k for k, trial in enumerate(found.trials) if trial is choice]
     report.table("trials", ResultTable(found.trials, _metrics(taken)), note=TRIED, bold=bold)
-    middle = taken.records[most_central(choice.fits.points)]
+    place = most_central(choice.fits.points)
+    middle, held = taken.records[place], choice.fits.relations.at(choice.fits.points)[place]
     model = read_law(law, middle.parameters)
     return Result(
         head,
-        [*equations(model, lead=f"at {middle.label}"), *shown],
+        [*equations(model, held=held, lead=f"at {middle.label}"), *shown],
         load='ep.operating.OperatingLaw.load("{}/law.json")',
         picture=next(name for name in ("map", "laws") if name in report.figures),
     )

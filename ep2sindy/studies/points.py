@@ -138,6 +138,12 @@ class Study:
     def __post_init__(self) -> None:
         names, _, _ = self._given.names, self._published, self._libraries
         points = read_points([source.parameters for source in self._given.sources], names)
+        if self._roles is not None and not {*self._roles.states} <= {*self.source.states}:
+            raise ValueError(
+                f"roles must name states, got {list(self._roles.states)} and the states "
+                f"{list(self.source.states)}: take sustained=none for terms of any kind, or state "
+                "roles of your own, sustained.roles (docs/roles.md)"
+            )
         if self._has_quantities:
             return
         # Points too few for a law, even if all oscillate, are refused before any simulation.
@@ -234,12 +240,12 @@ class Study:
         """The terms that are searched: of a signal, under roles, or all products."""
         if signal is not None:
             return signal.library(self.degree or 3)
-        states = list(self.source.states)
-        if self.sustained is None or self.sustained.roles is None:
-            return polynomial(states, degree=self.degree or 2)
-        roles = self.sustained.roles
-        library = polynomial(states, degree=self.sustained.degree or self.degree or 3)
-        return library.with_roles(self._known(roles, opened, report))
+        states, own = list(self.source.states), self.sustained
+        degree = self.degree or (own and own.degree)
+        if self._roles is None:
+            return polynomial(states, degree=degree or 2)
+        known = self._known(self._roles, opened, report)
+        return polynomial(states, degree=degree or 3).with_roles(known)
 
     def _known(self, roles: Roles, opened: Sequence[OpenedPoint], report: Report) -> Roles:
         """The roles with what is supplied at each point, by functions of it; else free."""
@@ -308,6 +314,13 @@ class Study:
     @property
     def _is_signal(self) -> bool:
         return len(self.source.states) == 1 and not self.models
+
+    @property
+    def _roles(self) -> Roles | None:
+        """The roles under which terms are searched; None of given terms and of one signal."""
+        if self.models or self._is_signal or self.sustained is None:
+            return None
+        return self.sustained.roles
 
     @property
     def _has_quantities(self) -> bool:
