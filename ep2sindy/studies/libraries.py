@@ -30,7 +30,7 @@ from ep2sindy.selection.criteria import Knee
 from ep2sindy.signals.attractor import find_cycle
 from ep2sindy.signals.driving import DRIVE, add_drive, ask_whether_driven, drop_repeats
 from ep2sindy.signals.signal import average_long, prepare_signal
-from ep2sindy.studies.balance import ModelBalance, add_balance, model_balance
+from ep2sindy.studies.balance import add_balance, model_balance
 from ep2sindy.studies.candidates import add_candidates, add_estimate
 from ep2sindy.studies.forecasts import add_forecasts, skill_of, why_none
 from ep2sindy.studies.library_result import (
@@ -41,7 +41,7 @@ from ep2sindy.studies.library_result import (
     refit,
     refitted_model,
 )
-from ep2sindy.studies.processes import NO_ZONES, Zones
+from ep2sindy.studies.processes import NO_ZONES, ComparedProcess, Zones
 from ep2sindy.studies.source import Source, columns_beside, n_before, split_in_time, zones_of
 from ep2sindy.studies.study import Coefficients, Fraction, PositiveOrAll, Terms, ZeroOrMore
 from ep2sindy.studies.sustained import (
@@ -248,9 +248,9 @@ class Study:
         n_samples = [run.n_samples if s is None else samples_in(run, s) for run in runs]
         refitted = refit(found, thesis, self.formulation, runs, rng)
         published = refitted_model(found, refitted)
-        sustained = beside = None
+        sustained, processes = None, list[ComparedProcess]()
         if self.sustained is not None and not found.model.inputs:
-            sustained, beside = self._sustain(
+            sustained, processes = self._sustain(
                 self.sustained, runs[0], library, zones, rng=rng, progress=progress
             )
         skill = skill_of(
@@ -269,25 +269,22 @@ class Study:
                 refitted=refitted,
                 published=None if published is None else over[0](published),
                 sustained=sustained,
-                balance=beside,
+                processes=processes,
                 skill=skill,
             )
 
     def _sustain(
         self, settings: SustainedSearch, run: Trajectory, library: Library, zones: Zones, *,
         rng: np.random.Generator, progress: Progress,
-    ) -> tuple[SustainedModel, ModelBalance]:  # fmt: skip
-        """The self-sustained model of a record, and the balance of its terms."""
+    ) -> tuple[SustainedModel, list[ComparedProcess]]:  # fmt: skip
+        """The self-sustained model of a record, and its processes next to the recorded ones."""
         rows = Regression(self.formulation, bootstraps=self.bootstraps)
         train, held = split_in_time(run, self.held_out or HELD_OUT)
         found = settings.found(train, library, rows, zones, rng=rng, progress=progress)
         model, bounds = found.model, settings.bounds
         with progress.stage(None, "", "free run"):
             free = evaluate(model, held, initial=start_of(held, model), bounds=bounds)
-        beside = model_balance(
-            model, found.constraint, run, train, held, zones, bounds, progress=progress
-        )
-        return SustainedModel(found, free), beside
+        return SustainedModel(found, free), model_balance(model, found.constraint, run, zones)
 
     def _tell(
         self,
@@ -300,9 +297,11 @@ class Study:
         report.found(find_best(results, len(files)))
         add_evaluations(report, results, files)
         for name, result in results.items():
-            if result.sustained is not None and result.balance is not None:
+            if result.sustained is not None:
                 add_sustained(report, name, result.sustained)
-                add_balance(report, name, result.balance, data, result.sustained.run.cycle)
+                if result.processes:
+                    cycle = result.sustained.run.cycle
+                    add_balance(report, name, result.processes, data, cycle)
             if result.skill is not None:
                 where = "seen by the search" if result.sustained is None else "held out"
                 title = f"{name}: forecasts over time {where}"

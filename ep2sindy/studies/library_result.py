@@ -19,8 +19,8 @@ from ep2sindy.regression.rows import Formulation
 from ep2sindy.report.document import Result, Table, Text
 from ep2sindy.report.report import Report
 from ep2sindy.report.results import ResultTable
-from ep2sindy.studies.balance import ModelBalance
 from ep2sindy.studies.candidates import CandidateRow, selected_metrics
+from ep2sindy.studies.processes import ComparedProcess
 from ep2sindy.studies.study import Coefficients
 from ep2sindy.studies.sustained import SUSTAINED_MODEL, SustainedModel
 from ep2sindy.studies.views import EVALUATED, EVALUATION, best_run, found_model
@@ -39,10 +39,10 @@ class LibraryResult:
     runs: free runs of the selected model over every record. thesis: the published coefficients as
     printed, by state. refitted: their terms fitted to our rows, and published: the run of that
     model over the first record; None if a state has none. sustained: a model that oscillates on its
-    own; None if none was asked for, or if the library has inputs. balance: of its zone, next to the
-    self-sustained model. skill: of forecasts by the self-sustained model over its held-out part, or
-    else by the selected one over the last quarter of the record, which it was fitted to; None if
-    there are none.
+    own; None if none was asked for, or if the library has inputs. processes: of that model, next to
+    those of its zone, if the record gives them. skill: of forecasts by the self-sustained model
+    over its held-out part, or else by the selected one over the last quarter of the record, which
+    it was fitted to; None if there are none.
     """
 
     discovery: Discovery
@@ -51,7 +51,7 @@ class LibraryResult:
     refitted: Mapping[str, Candidate]
     published: Evaluation | None
     sustained: SustainedModel | None
-    balance: ModelBalance | None
+    processes: Sequence[ComparedProcess]
     skill: ForecastSkill | None
 
     @property

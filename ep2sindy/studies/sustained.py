@@ -31,7 +31,7 @@ from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.selection.criteria import Selection
 from ep2sindy.signals.attractor import find_cycle, mean_cycle, white_variance
 from ep2sindy.signals.smoothers import KalmanSmoother
-from ep2sindy.signals.spectrum import power_spectrum, samples_in_periods
+from ep2sindy.signals.spectrum import power_spectrum
 from ep2sindy.studies.processes import NO_ZONES, TELLING, Zones, fit_roles
 from ep2sindy.studies.study import Count, Positive
 from ep2sindy.studies.views import CYCLE, add_samples
@@ -203,11 +203,3 @@ def start_of(run: Trajectory, model: SparseModel) -> np.ndarray:
     first = run.window(0, min(run.n_samples, 200))
     smoothed: np.ndarray = KalmanSmoother().smooth(first.t, first.columns(model.states))
     return smoothed[0]
-
-
-def two_periods(run: Trajectory) -> int | None:
-    """Samples in two periods; None if there is no period, or no room for two such windows."""
-    cycle = find_cycle(run.t, run.states)
-    if cycle is None or cycle.n_periods < 4.0:
-        return None
-    return samples_in_periods(2.0, frequency_Hz=cycle.frequency_Hz, dt_s=run.dt_s)
