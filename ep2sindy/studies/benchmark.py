@@ -291,9 +291,9 @@ def add_cells(report: Report, outcomes: pd.DataFrame) -> None:
     numbers = {str(n): headline_of(rows) for n, rows in found.groupby("variant", sort=False)}
     report.headline |= {f"{n}/{key}": v for n, each in numbers.items() for key, v in each.items()}
     conclude(report, pd.DataFrame(numbers).T, picture=name)
-    few = found[found["reason"] != ""].groupby("variant", sort=False).size() if is_map else ()
-    if len(few):
-        counts = ", ".join(f"{variant} {n}" for variant, n in few.items())
+    if is_map:
+        few = found[found["reason"] != ""].groupby("variant", sort=False).size()
+        counts = ", ".join(f"{variant} {n}" for variant, n in few.items()) or "none"
         report.add(f"Cells with too few samples to run: {counts}; tables/cells.csv says why.")
 
 

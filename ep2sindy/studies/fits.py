@@ -28,23 +28,22 @@ from ep2sindy.regression.rows import Formulation
 from ep2sindy.report.document import Text
 from ep2sindy.report.models import equations, interval_table
 from ep2sindy.report.report import Report
-from ep2sindy.report.results import Metric, Metrics, ResultTable, View
+from ep2sindy.report.results import ResultTable
 from ep2sindy.runtime.progress import count_pieces
 from ep2sindy.signals.spectrum import dominant_frequency
 from ep2sindy.studies.fitted import (
     FITTED,
+    SEVERAL,
+    SEVERAL_NOTE,
     STARTED,
     FirstModel,
     Fit,
     Fitted,
     RecordParts,
     Way,
-    ends,
-    expand,
     first_model,
     fitted_start,
-    n_sustained,
-    worst_amplitude,
+    ways_of,
     wrong_signs,
 )
 from ep2sindy.studies.over_points import add_points
@@ -60,7 +59,6 @@ from ep2sindy.studies.views import (
     add_samples,
     best_run,
     found_model,
-    largest,
 )
 
 if TYPE_CHECKING:
@@ -126,7 +124,7 @@ class Study:
 
     @cached_property
     def _ways(self) -> list[Way]:
-        return expand(self.fits, self.forms, self.formulation)
+        return ways_of(self.fits, self.forms, self.formulation)
 
     @cached_property
     def _libraries(self) -> dict[str, Library]:
@@ -188,7 +186,7 @@ class Study:
         pieces = [
             (name, way)
             for (name, structure), way in product(self.models.items(), self._ways)
-            if structure.fits is None or way.of in structure.fits
+            if structure.fits is None or way.name in structure.fits
         ]
         found = {}
         for name, way in count_pieces(report.watch, pieces, "fit", record.data.label):
@@ -317,32 +315,10 @@ class Study:
         report.section(f"Over {self.n_draws} draws of windows")
         report.table(
             "spread",
-            ResultTable(draws, SPREAD),
+            ResultTable(draws, SEVERAL),
             heading="fit",
-            title="lowest and highest, from the first sample",
-            note="Amplitude and waveform are those of the state that is farthest off.",
+            note=SEVERAL_NOTE,
         )
-
-
-def _range(ends: Sequence[float], form: str = "{:.3f} to {:.3f}", factor: float = 1.0) -> str:
-    low, high = (factor * value for value in ends)
-    return "-" if np.isnan(low) else form.format(low, high)
-
-
-_PERCENT = partial(_range, form="{:+.2f} to {:+.2f} %", factor=100.0)
-SPREAD: Metrics[Sequence[Evaluation]] = [
-    Metric("n_draws", len),
-    Metric("n_sustained", n_sustained, View.SHOWN, "sustained"),
-    Metric("f_error", partial(ends, lambda run: run.f_error), View.SHOWN, format=_PERCENT),
-    Metric("nrmse", partial(ends, lambda run: run.nrmse), View.SHOWN, format=_range),
-    Metric("amplitude", partial(ends, worst_amplitude), View.SHOWN, format=_range),
-    Metric(
-        "waveform",
-        partial(ends, lambda run: largest(run.waveform_error)),
-        View.SHOWN,
-        format=_range,
-    ),
-]
 
 
 def watcher(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 
 import pandas as pd
@@ -14,14 +13,20 @@ from ep2sindy.model.comparison import Status
 from ep2sindy.report.document import Result, Text
 from ep2sindy.report.models import equations
 from ep2sindy.report.report import Report
-from ep2sindy.report.results import Metric, Metrics, ResultTable, View, percent
-from ep2sindy.studies.fitted import FITTED, Fitted, ends, n_sustained, worst_amplitude
-from ep2sindy.studies.views import largest
+from ep2sindy.report.results import Metric, Metrics, ResultTable, View
+from ep2sindy.studies.fitted import (
+    FITTED,
+    SEVERAL,
+    SEVERAL_NOTE,
+    Fitted,
+    count_words,
+    n_sustained,
+    worst_amplitude,
+)
 
 NOTE = (
-    "Frequency, amplitude and waveform: the largest errors over the points, the first and the last "
-    "where the model has a cycle. Signs wrong: terms whose sign contradicts the recorded balance "
-    "of the same process, and at how many points."
+    f"{SEVERAL_NOTE} Signs wrong: terms whose sign contradicts the recorded balance of the same "
+    "process, and at how many points."
 )
 CAPTION = (
     "What becomes of every model, run freely from one sample at every operating point, by the way "
@@ -29,53 +34,18 @@ CAPTION = (
 )
 
 
-@dataclass(frozen=True, eq=False)
-class AtPoints:
-    """One fit at every operating point."""
-
-    fits: Sequence[Fitted]
-
-    @property
-    def runs(self) -> list[Evaluation]:
-        return [fit.from_sample for fit in self.fits]
-
-    @property
-    def elsewhere(self) -> str:
-        """What becomes of the model where it is not sustained, in words."""
-        words = [str(run.status) for run in self.runs if not run.holds]
-        return ", ".join(f"{word} at {words.count(word)}" for word in dict.fromkeys(words))
-
-    @property
-    def wrong(self) -> str:
-        """The terms whose sign contradicts the balance, and at how many points."""
-        terms = [term for fit in self.fits for term in fit.wrong]
-        return "; ".join(f"{term} at {terms.count(term)}" for term in dict.fromkeys(terms))
+def _runs(fits: Sequence[Fitted]) -> list[Evaluation]:
+    return [fit.from_sample for fit in fits]
 
 
-AT_POINTS: Metrics[AtPoints] = [
-    Metric("n_free", lambda each: max(fit.n_free for fit in each.fits), View.SHOWN, "free"),
-    Metric("n_sustained", lambda each: n_sustained(each.runs), View.FILES | View.HEADLINE),
+AT_POINTS: Metrics[Sequence[Fitted]] = [
+    Metric("n_free", lambda fits: max(fit.n_free for fit in fits), View.SHOWN, "free"),
+    *(metric.of(_runs) for metric in SEVERAL),
     Metric(
-        "sustained", lambda each: f"{n_sustained(each.runs)} of {len(each.runs)}", View.SCREEN
+        "wrong_signs", lambda fits: count_words([t for fit in fits for t in fit.wrong], "; "),
+        View.SHOWN, "signs wrong",
     ),
-    Metric("elsewhere", lambda each: each.elsewhere, View.SHOWN),
-    Metric(
-        "f_error",
-        lambda each: max(map(abs, ends(lambda run: run.f_error, each.runs))),
-        View.SHOWN, "frequency off by", percent(2),
-    ),
-    Metric(
-        "amplitude_error",
-        lambda each: max(abs(end - 1.0) for end in ends(worst_amplitude, each.runs)),
-        View.SHOWN, "amplitude off by", percent(0),
-    ),
-    Metric(
-        "waveform_error",
-        lambda each: max(ends(lambda run: largest(run.waveform_error), each.runs)),
-        View.SHOWN, "waveform", "{:.3f}",
-    ),
-    Metric("wrong_signs", lambda each: each.wrong, View.SHOWN, "signs wrong"),
-    Metric("source", lambda each: each.fits[0].structure.source),
+    Metric("source", lambda fits: fits[0].structure.source),
 ]  # fmt: skip
 
 
@@ -90,14 +60,14 @@ def add_points(
     if not found:
         raise ValueError("structures need a record to be fitted to: no operating point has one")
     first = next(iter(found.values()))
-    over = {name: AtPoints([fits[name] for fits in found.values()]) for name in first}
+    over = {name: [fits[name] for fits in found.values()] for name in first}
     sources = {fit.name: fit.structure.source for fit in first.values()}
     report.section(f"{len(over)} fits at {len(found)} operating points")
     draw = partial(sustained_figure, _rows(found), labels=labels)
     report.figure("sustained", draw, CAPTION)
     report.table("over_points", ResultTable(over, AT_POINTS), heading="fit", note=NOTE)
     report.section("Structures", *(f"{key}: {text}" for key, text in sources.items() if text))
-    rows = {f"{n}, {p}": fit for n in over for p, fit in zip(found, over[n].fits, strict=True)}
+    rows = {f"{n}, {p}": fit for n in over for p, fit in zip(found, over[n], strict=True)}
     report.section("Every point")
     report.table("fits", ResultTable(rows, FITTED), heading="fit", page_only=True)
     for number, (point, fits) in enumerate(found.items()):
@@ -106,13 +76,13 @@ def add_points(
             held_to = fit.first.held_to
             report.add(*equations(fit.model, held=held_to, lead=name, on_screen=False))
             report.model(f"{name}_{number}", fit.model, held=held_to, shown=False)
-    counts = {name: n_sustained(each.runs) for name, each in over.items()}
+    counts = {name: n_sustained(_runs(fits)) for name, fits in over.items()}
     lines = [
         Text(f"fits that sustain it at {n} of {len(found)} points: {', '.join(names)}")
         for n in range(len(found), 0, -1)
         if (names := [name for name, count in counts.items() if count == n])
     ]
-    structures = {over[name].fits[0].name for name, n in counts.items() if n == len(found)}
+    structures = {over[name][0].name for name, n in counts.items() if n == len(found)}
     report.found(
         Result(
             f"{len(structures)} of {len(sources)} structures sustain the oscillation at all "
