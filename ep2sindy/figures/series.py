@@ -25,9 +25,7 @@ from ep2sindy.figures.style import COLOURS, DATA, GREY, MORE_COLOURS, SMALL, TIT
 from ep2sindy.forecasting.forecast import LEVEL
 from ep2sindy.forecasting.skill import MODEL, ForecastSkill
 from ep2sindy.library.units import Clock, unit_product
-from ep2sindy.model.model import SparseModel
 from ep2sindy.model.rollout import Rollout
-from ep2sindy.signals.smoothers import Smoother
 from ep2sindy.signals.spectrum import dominant_frequency, power_spectrum
 
 SINCE_START = "time since start of integration"
@@ -35,7 +33,6 @@ SINCE_START = "time since start of integration"
 HARMONICS = 10.0  # of the fastest state, up to which spectra are drawn
 
 LABEL = 18  # letters in a line of a model's label next to or above its panel
-RARE = 0.01  # fraction of derivative samples, low or high, kept out of the scale as edge spikes
 
 
 def data_figure(run: Trajectory, *, duration_s: float, f_max_Hz: float | None = None) -> Figure:
@@ -78,46 +75,11 @@ def trajectory_figure(
     """
     data = first_part(run.t, run.states, duration_s, run.clock)
     models = _runs(rollouts, statuses, duration_s, run.clock)
-    titles = [style.axis_label(name, run.units[name]) for name in run.state_names]
-    x_label = _time_label(run.clock, duration_s, since)
-    return _draw_rows(data, models, titles, x_label, limits_of(data, models))
-
-
-def derivative_figure(
-    run: Trajectory, models: Mapping[str, SparseModel], *, smoother: Smoother, duration_s: float
-) -> Figure:
-    """A row per model: its right-hand side on the data (colour), the data's derivative (grey).
-
-    Spikes of the derivative do not set the scale.
-    """
-    clock, pieces = run.clock, run.segments()
-    slopes = np.concatenate([smoother.derivative(each.t, each.states) for each in pieces])
-    times = np.concatenate([each.t for each in pieces])
-    data = first_part(times, clock.seconds * slopes, duration_s, clock)
-    sides = []
-    for name, model in models.items():
-        slopes = model.derivative(run.columns(model.states), run.columns(model.inputs))
-        slopes = slopes[:, [model.states.index(state) for state in run.state_names]]
-        sides.append(first_part(run.t, clock.seconds * slopes, duration_s, clock, _label(name)))
-    titles = [style.slope_label(name, clock.rate_unit(run.units[name])) for name in run.state_names]
-    x_label, limits = _time_label(clock, duration_s), limits_of(data, sides, RARE)
-    return _draw_rows(data, sides, titles, x_label, limits)
-
-
-def _draw_rows(
-    data: Curves,
-    models: Sequence[Curves],
-    titles: Sequence[str],
-    x_label: str,
-    limits: Sequence[Limits],
-) -> Figure:
-    """Draw a row per model and a column per state, with the data in grey behind.
-
-    limits: of every column, which curves may leave.
-    """
+    n_states = len(run.state_names)
     height = float(np.clip(5.0 / len(models), 1.05, 2.2))
     size = (WIDTH, height * len(models) + 1.2)
-    figure, axes = style.make_panels(len(models), len(titles), size, sharex=True, sharey="col")
+    figure, axes = style.make_panels(len(models), n_states, size, sharex=True, sharey="col")
+    limits = limits_of(data, models)
     for row, colour, model in zip(axes, cycle(MORE_COLOURS), models, strict=False):
         for k, ax in enumerate(row):
             style.draw_over(ax, (data.x, data.y[:, k]), (model.x, model.y[:, k]), colour=colour)
@@ -126,9 +88,10 @@ def _draw_rows(
         row[0].set_ylabel(text, rotation=0, ha="right", va="center", labelpad=10)
     for ax in axes[1:].flat:  # panels of a column share their axis and so the first row's factor
         ax.yaxis.get_offset_text().set_visible(False)
-    for column, title in zip(axes.T, titles, strict=True):
-        column[0].set_title(title, fontsize=TITLE)
-    figure.supxlabel(x_label, fontsize=SMALL)  # once: three columns have no width for it
+    for column, name in zip(axes.T, run.state_names, strict=True):
+        column[0].set_title(style.axis_label(name, run.units[name]), fontsize=TITLE)
+    # Once: three columns have no width for it.
+    figure.supxlabel(_time_label(run.clock, duration_s, since), fontsize=SMALL)
     style.legend_above(figure, axes[0, 0].lines[:1])
     return figure
 
@@ -187,9 +150,9 @@ def _runs(
     ]
 
 
-def limits_of(data: Curves, models: Sequence[Curves], rare: float = 0.0) -> list[Limits]:
+def limits_of(data: Curves, models: Sequence[Curves]) -> list[Limits]:
     together = np.concatenate([curves.y for curves in models])
-    return [style.frame_limits(*pair, rare=rare) for pair in zip(data.y.T, together.T, strict=True)]
+    return [style.frame_limits(*pair) for pair in zip(data.y.T, together.T, strict=True)]
 
 
 def _run_label(name: str, run: Rollout, statuses: Mapping[str, str]) -> str:

@@ -53,7 +53,7 @@ from ep2sindy.studies.sustained import (
 from ep2sindy.studies.views import PlotRange, add_figures, add_samples
 from ep2sindy.trust.user_code import load_user_module
 
-FIGURES = ("data", "trajectories", "derivatives", "phase")
+FIGURES = ("data", "trajectories", "phase")
 HELD_OUT = 0.25  # fraction of a record that tests self-sustained models, unless a config says
 _FROM_MODULE = re.compile(r"(?P<module>[^\W\d][\w.]*)\.(?P<name>[^\W\d]\w*)(?P<argument>\(.*\))?")
 
@@ -327,7 +327,7 @@ class Study:
             report.model(name, result.discovery.model, clock=clock, held=held)
         selected = {name: result.runs[0] for name, result in results.items()}
         published = {f"{n}_thesis_terms": r.published for n, r in results.items() if r.published}
-        figures(FIGURES, runs=selected, smoother=self.formulation.smoother)
+        figures(FIGURES, runs=selected)
         add_samples(report, data, selected | published)
         for name, run in published.items():
             report.model(name, run.model, clock=clock, shown=False)

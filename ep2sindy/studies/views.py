@@ -20,7 +20,6 @@ from ep2sindy.report.document import Block, Result, Table, Text
 from ep2sindy.report.models import equations
 from ep2sindy.report.report import Report
 from ep2sindy.report.results import Metric, Metrics, View
-from ep2sindy.signals.smoothers import Smoother
 from ep2sindy.signals.spectrum import dominant_frequency
 from ep2sindy.studies.study import PositiveOrAll
 
@@ -32,7 +31,6 @@ CAPTIONS = {
     "trajectories": "Models integrated from the first sample (colour) over the data (grey).",
     "trajectories_started": "The same from a start fitted to the first one and a half periods.",
     "trajectories_thesis": "The same with the thesis's terms, fitted to these data.",
-    "derivatives": "Right-hand sides on the data (colour) over the data's derivative (grey).",
     "phase": "Phase portraits of the integrated models (colour) over the data (grey), dots where "
     "they start.",
 }
@@ -66,13 +64,11 @@ def add_figures(
     runs: Mapping[str, Evaluation],
     shown: PlotRange,
     *,
-    smoother: Smoother | None = None,
     since: str = series.SINCE_START,
     suffix: str = "",
 ) -> None:
     """Add the named figures of CAPTIONS; phase portraits need two states or more.
 
-    smoother: gives the data's derivative; without one there are no derivative figures.
     since: the origin of the time axis of runs, in words. suffix: to the names, for runs of another
     kind, which CAPTIONS describes by such a name.
     """
@@ -85,11 +81,6 @@ def add_figures(
             series.trajectory_figure, data, rollouts, duration_s=span, since=since, **how
         ),
     }
-    if smoother is not None:
-        models = {name: run.model for name, run in runs.items()}
-        drawn["derivatives"] = partial(
-            series.derivative_figure, data, models, smoother=smoother, duration_s=span
-        )
     if len(data.state_names) > 1:
         drawn["phase"] = partial(series.phase_figure, data, rollouts, duration_s=span, **how)
     for name in names:
