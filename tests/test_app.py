@@ -152,7 +152,7 @@ def test_runs_are_compared_by_plain_settings() -> None:
     settings: Any = OmegaConf.to_container(config(), resolve=True)
     found = by_places(settings, keys_of(Toy))
     assert found["n"] == 3
-    assert found["names"] == "['a', 'b']"
+    assert found["names"] == "a, b"
     assert found["search"] == "BestSubset"
     assert (found["rule"], found["rule.gamma"]) == ("EBIC", 0.5)
     assert found["many.one.width"] == 2.0

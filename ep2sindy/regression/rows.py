@@ -251,7 +251,7 @@ def _norms(
 
 @runtime_checkable
 class Formulation(Protocol):
-    """Interface that turns trajectories into regressions: one, or one per equation if rows differ."""
+    """Turns trajectories into regressions: one, or one per equation if rows differ."""
 
     def assemble(
         self, trajectories: Sequence[Trajectory], library: Library, *, rng: np.random.Generator

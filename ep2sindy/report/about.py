@@ -6,19 +6,6 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-ASKED = {  # keys of a config in the order of the page, with their names there
-    "data": "data",
-    "prepare": "preparation",
-    "trajectory": "time series",
-    "signal": "signal",
-    "libraries": "libraries",
-    "model": "model",
-    "formulation": "form of the regression",
-    "search": "search",
-    "bootstraps": "bootstraps",
-    "selection": "selection",
-    "depth": "candidates kept per size",
-}
 DATA = "data: "  # begins the message on what was read
 
 ASIDE = ("experiment", "study", "output", "figures", "thesis", "parallel")
@@ -60,29 +47,19 @@ class About:
 
 def settings_used(settings: Mapping[str, Any], keys: Collection[str]) -> dict[str, str]:
     """The settings that a study uses, in words; unset ones are left out."""
-    used = {*settings} & {*keys} - {*ASIDE}
-    ordered = [key for key in dict.fromkeys([*ASKED, *settings]) if key in used]
-    found = {ASKED.get(key, key.replace("_", " ")): setting_text(settings[key]) for key in ordered}
-    bare = {n: text[1:-1] if text.startswith("(") else text for n, text in found.items()}
-    return {name: text for name, text in bare.items() if text}
+    used = {key: setting_text(settings[key]) for key in settings if key in {*keys} - {*ASIDE}}
+    return {key.replace("_", " "): text for key, text in used.items() if text}
 
 
 def setting_text(value: Any) -> str:
-    """Text of a setting, such as `BestSubset (max_terms 4, n_best 2)`; empty if it is not set.
+    """Text of a setting, such as `BestSubset (max_terms 4, n_best 2)`; empty if it is not set."""
+    placed = by_place("", value)
+    name = placed.pop("", "")
+    parts = ", ".join(f"{at[1:]} {_number_text(each)}" for at, each in placed.items())
+    return f"{name} ({parts})" if name and parts else parts or _number_text(name)
 
-    A variable without a name in the file counts as not set.
-    """
-    if value is None or (isinstance(value, Mapping) and "name" in value and value["name"] is None):
-        return ""
-    if isinstance(value, Mapping):
-        parts = {str(k): setting_text(v) for k, v in value.items() if k != "_target_"}
-        inner = ", ".join(f"{k} {text}" for k, text in parts.items() if text)
-        name = str(value.get("_target_", "")).rpartition(".")[2]
-        if inner:
-            return f"{name} ({inner})".lstrip()
-        return "" if parts else name  # none of its parts is set
-    if isinstance(value, Sequence) and not isinstance(value, str):
-        return ", ".join(map(setting_text, value))
+
+def _number_text(value: object) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
@@ -97,7 +74,8 @@ def by_place(place: str, value: Any) -> dict[str, Any]:
             found |= by_place(f"{place}.{key}", each) if key != "_target_" else {}
         return found
     if isinstance(value, list):
-        return {place: str(value)} if value else {}
+        between = "; " if any(isinstance(each, Mapping) for each in value) else ", "
+        return {place: between.join(map(setting_text, value))} if value else {}
     return {place: value} if isinstance(value, int | float | str | bool) else {}
 
 

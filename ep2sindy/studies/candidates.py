@@ -16,7 +16,7 @@ from ep2sindy.estimation.estimate import Estimate, Rival
 from ep2sindy.figures.fronts import front_figure
 from ep2sindy.library.equations import equation_text
 from ep2sindy.library.units import Clock
-from ep2sindy.regression.front import Candidate, ParetoFront, Residual
+from ep2sindy.regression.front import Candidate, ParetoFront
 from ep2sindy.report.document import Equation, Table, Text
 from ep2sindy.report.report import Report
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View
@@ -58,18 +58,12 @@ REPLACED = (
 class CandidateRow:
     """A candidate of a front, or another fit of its equation next to them.
 
-    left: statistics of the residuals of the model's terms relative to the noise; None if the noise
-    is not known. lead: what another fit is, such as `thesis`.
+    lead: what another fit is, such as `thesis`.
     """
 
     candidate: Candidate
     is_selected: bool = False
-    left: Residual | None = None
     lead: str = ""
-
-    @property
-    def inclusion(self) -> dict[str, float]:
-        return dict(zip(self.candidate.terms, self.candidate.inclusion.tolist(), strict=True))
 
     def equation(self, clock: Clock) -> Equation:
         terms = {name: clock.seconds * coef for name, coef in self.candidate.coef_by_term.items()}
@@ -91,16 +85,6 @@ def candidate_metrics(label: str) -> Metrics[CandidateRow]:
         Metric(
             "text", lambda row: equation_text(row.candidate.equation, row.candidate.coef_by_term)
         ),
-    ]
-
-
-def selected_metrics(label: str) -> Metrics[CandidateRow]:
-    """Facts on a selected candidate. label: the name of the scores."""
-    return [
-        *candidate_metrics(label),
-        Metric("chi_squared", lambda row: row.left and row.left.chi_squared),
-        Metric("residual_autocorrelation", lambda row: row.left and row.left.autocorrelation),
-        Metric("inclusion", lambda row: row.inclusion),
     ]
 
 

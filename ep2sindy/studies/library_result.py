@@ -19,7 +19,7 @@ from ep2sindy.regression.rows import Formulation
 from ep2sindy.report.document import Result, Table, Text
 from ep2sindy.report.report import Report
 from ep2sindy.report.results import ResultTable
-from ep2sindy.studies.candidates import CandidateRow, selected_metrics
+from ep2sindy.studies.candidates import CandidateRow, candidate_metrics
 from ep2sindy.studies.processes import ComparedProcess
 from ep2sindy.studies.study import Coefficients
 from ep2sindy.studies.sustained import SUSTAINED_MODEL, SustainedModel
@@ -113,11 +113,12 @@ def add_tables(report: Report, results: Mapping[str, LibraryResult]) -> None:
     rows: dict[str, CandidateRow] = {}
     for name, result in results.items():
         chosen, refitted = result.discovery.chosen.items(), result.refitted.items()
-        left = result.discovery.noise_test.left
-        rows |= {f"{name}/{s}": CandidateRow(each, True, left.get(s)) for s, each in chosen}
+        rows |= {f"{name}/{s}": CandidateRow(each, True) for s, each in chosen}
         rows |= {f"{name}_thesis_terms/{s}": CandidateRow(each) for s, each in refitted}
     label = next(iter(results.values())).discovery.method.selection.label
-    report.table("equations", ResultTable(rows, selected_metrics(label)), heading="of", shown=False)
+    report.table(
+        "equations", ResultTable(rows, candidate_metrics(label)), heading="of", shown=False
+    )
     sustained = {
         f"{name}_sustained": each.sustained for name, each in results.items() if each.sustained
     }
