@@ -8,8 +8,8 @@ import xarray as xr
 
 import ep2sindy as ep
 from ep2sindy.library.roles import constraint_of, sum_known
-from ep2sindy.studies.balance import model_balance
 from ep2sindy.studies.processes import Zones, compared_processes, fit_roles
+from ep2sindy.studies.sustained import model_balance
 from tests.thrusters import brief
 
 STATES = ["n_i", "n_n"]

@@ -20,7 +20,6 @@ PROFILES = ("n_i", "n_n", "u_iz", "T_e_eV", "E_z", "ionization")
 MAPS = {"n_n": "viridis", "n_i": "magma"}  # legible with any colour vision, and in grey
 ENDS = ("mean", "low", "high", "min", "max")  # of a profile
 BAND_PERCENT = (5, 95)  # inner band of a profile, in percentiles
-READABLE = {"m/s": (1e-3, "km/s"), "V/m": (1e-3, "kV/m")}
 MS = 1e3
 
 
@@ -45,12 +44,12 @@ def profile_figure(field: xr.Dataset) -> Figure:
     z, band = CM * field["z"].values, "{} to {} % of the time".format(*BAND_PERCENT)
     for ax, name in zip(axes, names, strict=True):
         values = table[[f"{name}_{end}" for end in ENDS]].to_numpy().T
-        (mean, low, high, least, most), unit = scale_to_prefix(values, field[name].attrs["units"])
+        mean, low, high, least, most = values
         ax.fill_between(z, least, most, color=COLOURS[5], alpha=0.3, lw=0, label="whole range")
         ax.fill_between(z, low, high, color=COLOURS[0], alpha=0.35, lw=0, label=band)
         ax.plot(z, mean, color=DATA, lw=1.5, label="mean")
         ax.set_title(fill(_words(field[name]), 28), fontsize=TITLE)
-        ax.set_ylabel(unit)
+        ax.set_ylabel(style.unit_text(field[name].attrs["units"]))
         for end in _exit_cm(field):
             ax.axvline(end, color=DATA, lw=1.0, ls="--")
         ax.margins(x=0.0)
@@ -75,7 +74,7 @@ def space_time_figure(field: xr.Dataset, window: slice) -> Figure:
     style.legend_above(figure, axes[0].get_legend_handles_labels()[0])
     edges = CM * cell_edges(field["z"].values.astype(float))
     for ax, name in zip(axes[1:], names, strict=True):
-        values, unit = scale_to_prefix(along_z(shown[name]), field[name].attrs["units"])
+        values, unit = along_z(shown[name]), style.unit_text(field[name].attrs["units"])
         look: dict[str, Any] = {"cmap": MAPS[name], "vmin": 0.0, "rasterized": True}
         drawn = ax.pcolormesh(cell_edges(time), edges, values.T, **look)
         label = f"{_words(field[name])}\n({unit})"
@@ -93,18 +92,6 @@ def along_z(array: xr.DataArray) -> Float[np.ndarray, "time z"]:
     if "r" in array.dims:
         array = array.weighted(array["r"]).mean("r")
     return array.transpose("time", "z").values.astype(float)
-
-
-def scale_to_prefix(
-    values: Float[np.ndarray, "*shape"], unit: str
-) -> tuple[Float[np.ndarray, "*shape"], str]:
-    """Scale values to a readable power of ten: 2e18 m^-3 becomes 2 in units of 10^18 m^-3."""
-    factor, name = READABLE.get(unit, (1.0, unit))
-    largest = float(np.nanmax(np.abs(factor * values), initial=0.0))
-    if 1e-2 <= largest < 1e4 or largest == 0.0:
-        return factor * values, style.unit_text(name)
-    power = int(np.floor(np.log10(largest)))
-    return factor * values / 10.0**power, f"$10^{{{power}}}$ {style.unit_text(name)}"
 
 
 def _words(array: xr.DataArray) -> str:

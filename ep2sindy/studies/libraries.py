@@ -30,11 +30,10 @@ from ep2sindy.selection.criteria import Knee
 from ep2sindy.signals.attractor import find_cycle
 from ep2sindy.signals.driving import DRIVE, add_drive, ask_whether_driven, drop_repeats
 from ep2sindy.signals.signal import average_long, prepare_signal
-from ep2sindy.studies.balance import add_balance, model_balance
-from ep2sindy.studies.candidates import add_candidates, add_estimate
-from ep2sindy.studies.forecasts import add_forecasts, skill_of, why_none
-from ep2sindy.studies.library_result import (
+from ep2sindy.studies.discoveries import (
     LibraryResult,
+    add_candidates,
+    add_estimate,
     add_evaluations,
     add_tables,
     find_best,
@@ -47,10 +46,19 @@ from ep2sindy.studies.study import Coefficients, Fraction, PositiveOrAll, Terms,
 from ep2sindy.studies.sustained import (
     SustainedModel,
     SustainedSearch,
+    add_balance,
     add_sustained,
+    model_balance,
     start_of,
 )
-from ep2sindy.studies.views import PlotRange, add_figures, add_samples
+from ep2sindy.studies.views import (
+    PlotRange,
+    add_figures,
+    add_forecasts,
+    add_samples,
+    skill_of,
+    why_none,
+)
 from ep2sindy.trust.user_code import load_user_module
 
 FIGURES = ("data", "trajectories", "phase")
@@ -321,8 +329,7 @@ class Study:
         clock, figures = data.clock, partial(add_figures, report, data=data, shown=self.figures)
         report.section("The selected model" if len(results) == 1 else "The selected models")
         for name, result in results.items():
-            text = f"{name}: equations {result.how}; run freely: {result.runs[0].text}"
-            report.add(Text(text, page_only=True))
+            report.add(Text(f"{name}, run freely: {result.runs[0].text}", page_only=True))
             held = result.discovery.constraint
             report.model(name, result.discovery.model, clock=clock, held=held)
         selected = {name: result.runs[0] for name, result in results.items()}
