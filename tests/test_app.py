@@ -13,7 +13,7 @@ import ep2sindy as ep
 from ep2sindy.app.runner import list_studies, run_config, study_class
 from ep2sindy.app.schema import Configured, keys_of, study_of, value_of
 from ep2sindy.discovery.method import AnyMethod
-from ep2sindy.report.about import by_places
+from ep2sindy.report.page import by_places
 from ep2sindy.runtime.files import read_json
 from ep2sindy.selection.criteria import Selection
 from ep2sindy.studies.study import (

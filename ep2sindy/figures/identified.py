@@ -18,13 +18,6 @@ COUNTS = ("on_front", "selected")  # numbers of realizations
 
 MERITS = (*COUNTS, "mean_correct_terms")
 
-SYSTEM_LABELS = {
-    "oscillator": "damped oscillator",
-    "lotka_volterra": "Lotka–Volterra",
-    "van_der_pol": "Van der Pol",
-    "lorenz": "Lorenz",
-}
-
 # Merit -> title, format of a cell, and its width in inches.
 PANELS = {
     "on_front": ("true equations on the front (%)", "{:.0f}", 0.36),
@@ -133,6 +126,6 @@ def _draw_heat_map(ax: Axes, table: pd.DataFrame, form: str) -> None:
     ax.spines[:].set_visible(False)
     systems = table.columns.get_level_values(0)
     for system in systems.unique():
-        places, label = np.flatnonzero(systems == system), SYSTEM_LABELS.get(system, system)
+        places, label = np.flatnonzero(systems == system), system.replace("_", " ").title()
         ax.text(places.mean() + 0.5, -0.25, label, ha="center", va="bottom", fontsize=SMALL)
         ax.axvline(places[0], color="white", lw=5)

@@ -55,7 +55,6 @@ from ep2sindy.studies.source import DivergedError, Source, split_in_time, zones_
 from ep2sindy.studies.structures import Structures
 from ep2sindy.studies.study import Count, Fraction, Positive, PositiveOrAll, ZeroOrMore
 from ep2sindy.studies.views import (
-    EVALUATION,
     PlotRange,
     add_figures,
     add_samples,
@@ -298,10 +297,8 @@ class Study:
                 row: dict[str, Any] = {
                     "fit": name,
                     "window": length,
-                    "periods": (length - 1) / period,
                     "loss": found.loss,
                     "status": str(found.status),
-                    "text": found.model.text(),
                 }
                 for end in ("", STARTED):
                     run = self._evaluate(found.model, record, started=bool(end))
@@ -320,8 +317,6 @@ class Study:
             seeds = count_pieces(report.watch, range(self.n_draws), "draw", name)
             refinements = [self._refine(each.first, record, report, seed=seed) for seed in seeds]
             draws[name] = [self._evaluate(found.model, record) for found in refinements]
-        rows = {f"{name}, {k}": run for name, runs in draws.items() for k, run in enumerate(runs)}
-        report.samples("draws", ResultTable(rows, EVALUATION).csv("draw"))
         report.section(f"Over {self.n_draws} draws of windows")
         report.table(
             "spread",

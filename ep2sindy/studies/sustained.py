@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
+import pandas as pd
 
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import Trajectory
@@ -68,8 +69,8 @@ BALANCE_NOTE = (
     "the model's rate against the record's, sample by sample."
 )
 COUNTERPARTS = (
-    "By the record: the coefficients of the same terms by least squares of the recorded process on "
-    "them, with its R2 at each instant."
+    "Counterpart: the coefficients of the same terms by least squares of the recorded process on "
+    "them, with the R2 of that fit at each instant; ratio: the model's over the record's."
 )
 
 
@@ -245,33 +246,16 @@ PROCESSES: Metrics[ComparedProcess] = [
 ]  # fmt: skip
 
 
-@dataclass(frozen=True, eq=False)
-class ProcessTerm:
-    """One term of a process of the model."""
-
-    process: ComparedProcess
-    term: str
-
-    @property
-    def coef(self) -> float:
-        return self.process.coef[self.term]
-
-    @property
-    def counterpart(self) -> float:
-        """The coefficient by least squares of the recorded process on all of its terms, or NaN."""
-        return self.process.counterpart.get(self.term, np.nan)
-
-
-TERMS: Metrics[ProcessTerm] = [
-    Metric("part", lambda each: each.process.name, View.SHOWN, "process"),
-    Metric("term", lambda each: each.term, View.SHOWN),
-    Metric("coefficient", lambda each: each.coef, View.SHOWN),
-    Metric("counterpart", lambda each: each.counterpart, View.SHOWN, "by the record"),
-    Metric(
-        "ratio", lambda each: each.coef / (each.counterpart or np.nan), View.SHOWN, format="{:.2f}"
-    ),
-    Metric("fit_r2", lambda each: each.process.fit_r2, View.SHOWN, "its R2", "{:.3f}"),
-]
+def process_terms(processes: Sequence[ComparedProcess]) -> pd.DataFrame:
+    """One row per process and term: its coefficient in the model and by the record."""
+    rows = []
+    for each in processes:
+        for term, coef in each.coef.items():
+            recorded = each.counterpart.get(term, np.nan)
+            ratio = coef / (recorded or np.nan)
+            rows.append((each.name, term, coef, recorded, ratio, each.fit_r2))
+    columns = ["part", "term", "coefficient", "counterpart", "ratio", "fit_r2"]
+    return pd.DataFrame(rows, columns=columns)
 
 
 def model_balance(
@@ -310,6 +294,5 @@ def add_balance(
         parts = {each.name: (each.recorded[shown], each.modelled[shown]) for each in known}  # type: ignore[index]
         draw = partial(balance_figure, data.t[shown], parts, clock=data.clock)
         report.figure(f"balance_{name}", draw, CAPTIONS["balance"])
-    terms = [ProcessTerm(each, term) for each in processes for term in each.coef]
-    title = "each term by its process"
-    report.table(f"terms_{name}", ResultTable(terms, TERMS), title=title, note=COUNTERPARTS)
+    terms, title = process_terms(processes), "each term by its process"
+    report.table(f"terms_{name}", terms, title=title, note=COUNTERPARTS)

@@ -37,9 +37,9 @@ CAPTIONS = {
     "they start.",
     "forecast": "Forecast of the last part of the record, its start estimated from the past "
     "alone, with the band that is to hold 90 % of the samples. Last panel: error of forecasts from "
-    "starts all over that part, by horizon (1: no better than the mean); persistence: the last sample "
-    "stays; harmonics: the mean cycle continues; autoregression: linear in the samples or in their "
-    "logarithms, its order by AIC; neighbours: what followed the most similar moments.",
+    "starts all over that part, by horizon (1: no better than the mean); persistence: the last "
+    "sample stays; harmonics: the mean cycle continues; autoregression: linear in the samples or "
+    "in their logarithms, its order by AIC; neighbours: what followed the most similar moments.",
 }
 
 
