@@ -44,8 +44,9 @@ TOYS: dict[str, list[str]] = {
         "systems=[oscillator,lotka_volterra]", "noises=[0.0,0.05]", "parallel=serial",
     ],
     "weak": [
-        "+exp=weak", *ON_FILE, LINE, ZONE, "fits.boxes.n_windows=[500]",
-        "fits.boxes.n_points=[10,50]",
+        "+exp=weak", *ON_FILE, LINE, ZONE, "~fits.n_points_70", "~fits.n_points_300",
+        "forms.n_points_10.test_functions.n_windows=500",
+        "forms.n_points_50.test_functions.n_windows=500",
     ],
     "weak_windows": [
         "+exp=weak_windows",

@@ -13,7 +13,7 @@ import ep2sindy as ep
 from ep2sindy.app.runner import list_studies, run_config, study_class
 from ep2sindy.app.schema import Configured, keys_of, study_of, value_of
 from ep2sindy.discovery.method import AnyMethod
-from ep2sindy.report.about import by_places
+from ep2sindy.report.page import by_places
 from ep2sindy.runtime.files import read_json
 from ep2sindy.selection.criteria import Selection
 from ep2sindy.studies.study import (
@@ -152,7 +152,7 @@ def test_runs_are_compared_by_plain_settings() -> None:
     settings: Any = OmegaConf.to_container(config(), resolve=True)
     found = by_places(settings, keys_of(Toy))
     assert found["n"] == 3
-    assert found["names"] == "['a', 'b']"
+    assert found["names"] == "a, b"
     assert found["search"] == "BestSubset"
     assert (found["rule"], found["rule.gamma"]) == ("EBIC", 0.5)
     assert found["many.one.width"] == 2.0

@@ -8,9 +8,8 @@ import xarray as xr
 
 import ep2sindy as ep
 from ep2sindy.library.roles import constraint_of, sum_known
-from ep2sindy.studies.balance import model_balance
 from ep2sindy.studies.processes import Zones, compared_processes, fit_roles
-from ep2sindy.studies.source import split_in_time
+from ep2sindy.studies.sustained import model_balance
 from tests.thrusters import brief
 
 STATES = ["n_i", "n_n"]
@@ -177,57 +176,18 @@ def test_counterparts_are_those_of_the_record(data: ep.Trajectory, exact: xr.Dat
     assert found["neutrals that enter"].counterpart == pytest.approx({"1": entered})
 
 
-def test_terms_left_out_go_with_those_that_follow_them(data: ep.Trajectory, exact: xr.Dataset):
-    values = {
-        ("n_n to n_i", "n_i*n_n"): 5e-14, ("n_i out", "n_i"): 5e5, ("n_n out", "n_n"): 3e3
-    }  # fmt: skip
-    model, held_to = under(ROLES, values)
-    parts = split_in_time(data, 0.25)
-    beside = model_balance(
-        model, held_to, data, *parts, Zones({"": exact}), ep.model.FreeRunBounds()
-    )
-    roles = {(each.part.split(",")[0], each.term): each for each in beside.terms}
-    assert [each.term for each in beside.terms] == ["1", "n_i*n_n", "n_i", "n_n"]
-    entering = roles["neutrals that enter", "1"]
-    assert entering.without is None
-    assert entering.status == "known"  # it is not left out
-    assert entering.counterpart == pytest.approx(float(exact["supply"].mean()))
-    without = roles["neutrals that leave", "n_n"].without
-    assert without is not None
-    assert list(without.model.terms("n_n")) == ["1", "n_i*n_n"]
-    assert without.model.terms("n_n")["1"] == 2e23
-
-
-@pytest.mark.parametrize("stated", [True, False])
-def test_a_process_left_out_leaves_those_that_share_its_coefficient(data, exact, stated) -> None:
-    """Of what ions lose by n_i, what leaves goes and what comes back stays, stated or found."""
-    back = ("n_i to n_n", "n_i")
-    values = {("n_n to n_i", "n_i*n_n"): 5e-14, ("n_i out", "n_i"): 4e5, ("n_n out", "n_n"): 3e3}
-    roles = replace(ROLES, exchange=[("n_n", "n_i"), ("n_i", "n_n", {"n_i": 1e5})])
-    model, held_to = under(roles, values) if stated else under(ROLES, values | {back: 1e5})
-    parts = split_in_time(data, 0.25)
-    beside = model_balance(
-        model, held_to, data, *parts, Zones({"": exact}), ep.model.FreeRunBounds()
-    )
-    found = {(each.part.split(",")[0], each.term): each for each in beside.terms}
-    returned = found["ions that become neutrals", "n_i"]
-    assert returned.is_known == stated
-    without = found["ions that leave", "n_i"].without
-    assert without is not None
-    kept = {state: without.model.terms(state) for state in STATES}
-    assert kept["n_n"]["n_i"] == -kept["n_i"]["n_i"]
-    if stated:
-        assert (returned.status, kept["n_n"]["n_i"]) == ("known", 1e5)
-    else:
-        assert returned.without is not None
-        assert "n_i" not in returned.without.model.terms("n_n")
+def test_a_model_next_to_its_balance_has_the_processes_of_its_roles(data, exact) -> None:
+    found, zones = under(ROLES, VALUES), Zones({"": exact})
+    compared = model_balance(*found, data, zones)
+    assert [each.coef for each in compared] == [
+        {"1": 2e23}, {"n_n": 200.0, "n_i*n_n": pytest.approx(4e-14)}, {"n_i": pytest.approx(4e5)},
+        {"n_n": pytest.approx(1000.0)},
+    ]  # fmt: skip
+    assert not model_balance(*found, data, Zones({}))  # a record without a balance
 
 
 def test_a_model_with_functions_has_no_processes(data: ep.Trajectory, exact: xr.Dataset) -> None:
     library = ep.polynomial(STATES, degree=1, functions=["sqrt(n_i)"])
     coef = ep.model.coef_matrix(library, [{"n_i": -1e5, "sqrt(n_i)": 1e14}, {"n_n": -1e5}])
     model = ep.SparseModel(library, STATES, coef, dict.fromkeys(STATES, "m^-3"))
-    parts = split_in_time(data, 0.25)
-    beside = model_balance(model, None, data, *parts, Zones({"": exact}), ep.model.FreeRunBounds())
-    assert not beside.processes
-    assert {each.part for each in beside.terms} == {*STATES}
+    assert not model_balance(model, None, data, Zones({"": exact}))

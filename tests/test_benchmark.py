@@ -23,7 +23,6 @@ from ep2sindy.studies.benchmark import (
     Variant,
     cells,
     coefficient_error,
-    error_cells,
     merits,
 )
 from ep2sindy.systems.draws import realization
@@ -238,11 +237,11 @@ def errors_of(forms: Mapping[str, Weak], noises: Sequence[float], **settings) ->
 
 def test_more_and_longer_windows_bear_more_noise() -> None:
     forms = {f"{n}_{length}": boxes(n, length) for n in (100, 2000) for length in (10, 100)}
-    means = error_cells(errors_of(forms, [0.0, 0.05], n_realizations=4, seed=1), forms)
+    means = cells(errors_of(forms, [0.0, 0.05], n_realizations=4, seed=1))
     assert means["n"].tolist() == [4] * 2 * 4
-    noisy = means[means["noise"] == 0.05].set_index(["n_windows", "n_points"])["error_mean"]
-    assert noisy[2000, 100] < noisy[2000, 10] < noisy[100, 10]
-    assert noisy[2000, 100] < noisy[100, 100] < noisy[100, 10]
+    noisy = means[means["noise"] == 0.05].set_index("variant")["error_mean"]
+    assert noisy["2000_100"] < noisy["2000_10"] < noisy["100_10"]
+    assert noisy["2000_100"] < noisy["100_100"] < noisy["100_10"]
 
 
 def test_levels_of_noise_share_their_draws() -> None:

@@ -86,15 +86,15 @@ def test_every_definition_makes_a_variant() -> None:
 
 def test_a_frontier_says_where_variants_cannot_run(tmp_path: Path) -> None:
     frontier = programs.computed(composed("frontier", *toy("frontier", tmp_path)))
-    points = frontier.summary["points"]
-    found = {(p["variant"], p["rate_Hz"], p["duration_s"]): p["identified"] for p in points}
-    assert [key[1:] for key in found][:4] == [(1, 5), (1, 40), (20, 5), (20, 40)]
+    points = frontier.summary["cells"]
+    found = {(p["variant"], p["rate_Hz"], p["duration_s"]): p["on_front"] for p in points}
+    assert {key[1:] for key in found} == {(1, 5), (1, 40), (20, 5), (20, 40)}
     assert len(found) == 8
     assert (found["STLSQ", 20, 40], found["ours", 20, 40], found["STLSQ", 1, 5]) == (1, 1, 0)
     headline = frontier.report.headline
     for name in ("STLSQ", "ours"):
         identified = [value for key, value in found.items() if key[0] == name]
-        assert headline[f"{name}/identified_percent"] == 25.0 * sum(identified)
+        assert headline[f"{name}/on_front_percent"] == 25.0 * sum(identified)
     assert "STLSQ 1" in frontier.page  # too few samples to smooth
     frontier.check_figures("frontier")
 
@@ -103,11 +103,12 @@ def test_every_kind_of_window_has_an_error(tmp_path: Path) -> None:
     found = programs.computed(composed("weak_windows", *toy("weak_windows", tmp_path)))
     cells = found.summary["cells"]
     assert len(cells) == 2 * (4 + 3)
-    others = {cell["fit"] for cell in cells if cell["n_points"] is None}
-    assert others == {"differential", "automatic", "automatic_weighted"}
+    grid = {f"n_windows_{n}_n_points_{length}" for n in (100, 300) for length in (10, 30)}
+    others = {"differential", "automatic", "automatic_weighted"}
+    assert {cell["variant"] for cell in cells} == grid | others
     assert all(cell["n"] == 2 for cell in cells)
-    assert found.report.headline["n_windows_100_n_points_10/error_10_percent"] > 0.0
-    found.check_figures("errors")
+    assert found.report.headline["n_windows_100_n_points_10/error_mean"] > 0.0
+    found.check_figures("benchmark")
 
 
 @pytest.mark.parametrize(

@@ -67,7 +67,7 @@ def test_breathing_finds_predator_and_prey(breathing_run: Path) -> None:
     assert ions == pytest.approx({"n_i": -1.64e5, "n_i*n_n": 4.66e-14}, rel=0.02)
     assert neutrals == pytest.approx({"n_n": 4.39e4, "n_i*n_n": -4.66e-14}, rel=0.02)
     run = summary["evaluations"]["simple"]
-    assert run["frequency_Hz"] == pytest.approx(run["record_frequency_Hz"], rel=0.02)
+    assert run["f_error"] == pytest.approx(0.0, abs=0.02)
     refitted = {"simple_sustained", "simple_thesis_terms"}
     assert set(summary["models"]) >= {"simple", "ionization", "velocity"} | refitted
 
@@ -88,10 +88,7 @@ def test_breathing_ends_in_a_model_that_is_sustained(breathing_run: Path) -> Non
     assert ions == pytest.approx(-1.64e5, rel=1e-4)
     low, high = model["intervals"]["n_i"]["n_i"]  # the spread over windows: the model may be wrong
     assert low < ions < high
-    terms = {(each["part"], each["term"]): each for each in found["terms_simple"]}
-    assert len(terms) == 4
-    assert all(each["without_status"] != "sustained" for each in terms.values())
-    assert "balance_simple" not in found
+    assert not {"balance_simple", "terms_simple"} & {*found}  # free terms are no processes
 
 
 def test_a_run_folder_holds_all_that_it_takes_to_look_again(breathing_run: Path) -> None:

@@ -41,7 +41,11 @@ STRAIGHT = ", ".join(f"{{V_D_V: {300 + 10 * k}, mdot_mg_s: {4 + k}}}" for k in r
         ),
         ("predict", [f"points=[{FEW}]"], "a law of 3 functions of ['V_D_V', 'mdot_mg_s'] needs m"),
         ("predict", [f"points=[{STRAIGHT}]"], "4 points do not tell the 3 terms of a law apart"),
-        ("weak", ["fits.boxes.form=box"], "fits.boxes.form must be null, balance or one of ['boxe"),
+        (
+            "weak",
+            ["fits.automatic.form=box"],
+            "fits.automatic.form must be null, balance or one of ['n_points_10', ",
+        ),
     ],
 )
 def test_settings_that_cannot_work_are_refused(

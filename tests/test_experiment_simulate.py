@@ -72,7 +72,7 @@ def test_a_run_keeps_its_field_and_says_what_it_did(one: Path, field: xr.Dataset
 
 
 def test_every_figure_and_table_of_a_run_is_there(one: Path) -> None:
-    for name in ("current", "spectrum", "profiles", "maps"):
+    for name in ("current", "profiles", "maps"):
         assert (one / "figures" / f"{name}.png").stat().st_size > 8e3
     profiles = pd.read_csv(one / "tables" / "profiles.csv")
     assert len(profiles) == 24

@@ -20,7 +20,7 @@ from ep2sindy.data.mapping import read_array
 from ep2sindy.data.readers.registry import open_source
 from ep2sindy.library.names import split_term
 from ep2sindy.library.units import SECONDS
-from ep2sindy.report.picture import read_png
+from ep2sindy.report.page import read_png
 from ep2sindy.report.results import value_text
 from ep2sindy.runtime.files import check_regular, read_bytes
 from ep2sindy.thruster.axial.settings import Settings

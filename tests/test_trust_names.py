@@ -15,10 +15,8 @@ from programs import composed
 import ep2sindy as ep
 from ep2sindy.app.runner import run_config, start_run
 from ep2sindy.app.schema import value_of
-from ep2sindy.report.about import About
 from ep2sindy.report.document import Equation, Link, Picture, Section, Table, Text
-from ep2sindy.report.page import page_html
-from ep2sindy.report.picture import draw
+from ep2sindy.report.page import About, draw, page_html
 from ep2sindy.report.screen import Screen
 
 PATHS = ["../../x", "/tmp/x", "a/b", "a\\b", "..", ".", "", "~x", "a\nb", "a\0b", "x" * 300]

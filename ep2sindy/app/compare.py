@@ -23,11 +23,9 @@ from ep2sindy.app.config_files import check_config
 from ep2sindy.data.readers.source import damage_named
 from ep2sindy.library.units import SECONDS, Clock
 from ep2sindy.model.model import SparseModel
-from ep2sindy.report.about import by_place
 from ep2sindy.report.document import Block, Link, Picture, Section, Table, Text, cell_text
 from ep2sindy.report.models import equations, intervals
-from ep2sindy.report.page import page_html
-from ep2sindy.report.picture import read_png
+from ep2sindy.report.page import by_place, page_html, read_png
 from ep2sindy.report.results import in_words, value_text
 from ep2sindy.report.screen import Screen
 from ep2sindy.runtime.files import read_bytes, read_json, write_text

@@ -1,4 +1,4 @@
-"""Figures of a simulated discharge, with its maps over z and time."""
+"""Figures of a simulated discharge: profiles along its axis, and maps over z and time."""
 
 from __future__ import annotations
 
@@ -9,67 +9,18 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 from jaxtyping import Float
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ep2sindy.data.fields import cell_edges, channel_length_m
 from ep2sindy.figures import style
 from ep2sindy.figures.maps import CM
 from ep2sindy.figures.style import COLOURS, DATA, GREY, TITLE, WIDTH
-from ep2sindy.signals.spectrum import power_spectrum
 
 PROFILES = ("n_i", "n_n", "u_iz", "T_e_eV", "E_z", "ionization")
 MAPS = {"n_n": "viridis", "n_i": "magma"}  # legible with any colour vision, and in grey
 ENDS = ("mean", "low", "high", "min", "max")  # of a profile
 BAND_PERCENT = (5, 95)  # inner band of a profile, in percentiles
-READABLE = {"m/s": (1e-3, "km/s"), "V/m": (1e-3, "kV/m")}
-MS, KHZ = 1e3, 1e-3
-
-
-def current_figure(field: xr.Dataset, window: slice) -> Figure:
-    """The discharge current over the whole record, and with the beam current over a few periods."""
-    figure, ((whole,), (part,)) = style.make_panels(2, 1, (WIDTH, 4.8))
-    time, shown = MS * field["time"].values, field.isel(time=window)
-    whole.plot(time, field["I_d"].values, color=DATA, lw=0.5)
-    if window.stop - window.start < time.size:
-        whole.axvspan(time[window.start], time[window.stop - 1], color=COLOURS[4], alpha=0.35, lw=0)
-    part.plot(time[window], shown["I_d"].values, color=DATA, lw=1.3, label="discharge current")
-    if "I_beam" in field:
-        beam: dict[str, Any] = {"color": COLOURS[0], "ls": "--", "label": "ion beam current"}
-        part.plot(time[window], shown["I_beam"].values, lw=1.3, **beam)
-    for ax in (whole, part):
-        ax.set_ylabel("current (A)")
-        ax.margins(x=0.0)
-        _show_zero(ax)
-    part.set_xlabel("time after the warm-up (ms)")
-    style.legend_above(figure, part.get_legend_handles_labels()[0])
-    return figure
-
-
-def current_spectrum_figure(
-    field: xr.Dataset, *, f_kHz: float, f_max_Hz: float, transit_Hz: float
-) -> Figure:
-    """Power spectrum of the discharge current on logarithmic axes, with the peak marked.
-
-    f_kHz: frequency of the peak, NaN if there is none. transit_Hz: frequency above which
-    oscillations are those of ions in transit.
-    """
-    frequency, power = power_spectrum(field["time"].values, field["I_d"].values)
-    shown = (frequency > 0.0) & (frequency <= f_max_Hz)
-    figure, ((ax,),) = style.make_panels(1, 1, (WIDTH, 3.8))
-    floor = max(1e-12 * power.max(), np.finfo(float).tiny)
-    ax.loglog(KHZ * frequency[shown], np.maximum(power[shown], floor), color=DATA, lw=0.8)
-    if np.isfinite(f_kHz):
-        label = f"peak, {f_kHz:.1f} kHz"
-        ax.axvline(f_kHz, color=COLOURS[1], lw=1.2, ls="--", label=label)
-    if f_max_Hz > transit_Hz:
-        limits = KHZ * transit_Hz, KHZ * f_max_Hz
-        ax.axvspan(*limits, color=GREY, alpha=0.25, lw=0, label="transit range")
-    ax.set(xlabel="frequency (kHz)", ylabel=f"power of the current ({style.unit_text('A^2/Hz')})")
-    ax.set_xlim(KHZ * frequency[shown][0], KHZ * frequency[shown][-1])
-    ax.grid(alpha=0.3)
-    style.legend_above(figure, ax.get_legend_handles_labels()[0])
-    return figure
+MS = 1e3
 
 
 def profile_table(field: xr.Dataset) -> pd.DataFrame:
@@ -93,12 +44,12 @@ def profile_figure(field: xr.Dataset) -> Figure:
     z, band = CM * field["z"].values, "{} to {} % of the time".format(*BAND_PERCENT)
     for ax, name in zip(axes, names, strict=True):
         values = table[[f"{name}_{end}" for end in ENDS]].to_numpy().T
-        (mean, low, high, least, most), unit = scale_to_prefix(values, field[name].attrs["units"])
+        mean, low, high, least, most = values
         ax.fill_between(z, least, most, color=COLOURS[5], alpha=0.3, lw=0, label="whole range")
         ax.fill_between(z, low, high, color=COLOURS[0], alpha=0.35, lw=0, label=band)
         ax.plot(z, mean, color=DATA, lw=1.5, label="mean")
         ax.set_title(fill(_words(field[name]), 28), fontsize=TITLE)
-        ax.set_ylabel(unit)
+        ax.set_ylabel(style.unit_text(field[name].attrs["units"]))
         for end in _exit_cm(field):
             ax.axvline(end, color=DATA, lw=1.0, ls="--")
         ax.margins(x=0.0)
@@ -107,19 +58,23 @@ def profile_figure(field: xr.Dataset) -> Figure:
 
 
 def space_time_figure(field: xr.Dataset, window: slice) -> Figure:
-    """The current, and below it neutral and ion density over time and z, for a few periods."""
+    """The currents, and below them neutral and ion density over time and z, for a few periods."""
     names = [name for name in MAPS if name in field]
     shown = field.isel(time=window)
     time = MS * shown["time"].values
     size, heights = (WIDTH, 1.7 + 2.4 * len(names)), [1.0, *[1.7] * len(names)]
     figure, grid = style.make_panels(1 + len(names), 1, size, sharex=True, heights=heights)
     axes = grid[:, 0]
-    axes[0].plot(time, shown["I_d"].values, color=DATA, lw=1.3)
-    axes[0].set_ylabel("discharge\ncurrent (A)")
-    _show_zero(axes[0])
+    axes[0].plot(time, shown["I_d"].values, color=DATA, lw=1.3, label="discharge")
+    if "I_beam" in field:
+        beam: dict[str, Any] = {"color": COLOURS[0], "ls": "--", "label": "ion beam"}
+        axes[0].plot(time, shown["I_beam"].values, lw=1.3, **beam)
+    axes[0].set_ylabel("current (A)")
+    axes[0].axhline(0.0, color=GREY, lw=0.8)  # a steady current must not look like a moving one
+    style.legend_above(figure, axes[0].get_legend_handles_labels()[0])
     edges = CM * cell_edges(field["z"].values.astype(float))
     for ax, name in zip(axes[1:], names, strict=True):
-        values, unit = scale_to_prefix(along_z(shown[name]), field[name].attrs["units"])
+        values, unit = along_z(shown[name]), style.unit_text(field[name].attrs["units"])
         look: dict[str, Any] = {"cmap": MAPS[name], "vmin": 0.0, "rasterized": True}
         drawn = ax.pcolormesh(cell_edges(time), edges, values.T, **look)
         label = f"{_words(field[name])}\n({unit})"
@@ -137,23 +92,6 @@ def along_z(array: xr.DataArray) -> Float[np.ndarray, "time z"]:
     if "r" in array.dims:
         array = array.weighted(array["r"]).mean("r")
     return array.transpose("time", "z").values.astype(float)
-
-
-def scale_to_prefix(
-    values: Float[np.ndarray, "*shape"], unit: str
-) -> tuple[Float[np.ndarray, "*shape"], str]:
-    """Scale values to a readable power of ten: 2e18 m^-3 becomes 2 in units of 10^18 m^-3."""
-    factor, name = READABLE.get(unit, (1.0, unit))
-    largest = float(np.nanmax(np.abs(factor * values), initial=0.0))
-    if 1e-2 <= largest < 1e4 or largest == 0.0:
-        return factor * values, style.unit_text(name)
-    power = int(np.floor(np.log10(largest)))
-    return factor * values / 10.0**power, f"$10^{{{power}}}$ {style.unit_text(name)}"
-
-
-def _show_zero(ax: Axes) -> None:
-    """Draw the line of zero, so that a steady current does not look like a moving one."""
-    ax.axhline(0.0, color=GREY, lw=0.8)
 
 
 def _words(array: xr.DataArray) -> str:

@@ -18,14 +18,12 @@ COUNTS = ("on_front", "selected")  # numbers of realizations
 
 MERITS = (*COUNTS, "mean_correct_terms")
 
-SYSTEM_LABELS = {
-    "oscillator": "damped oscillator",
-    "lotka_volterra": "Lotka–Volterra",
-    "van_der_pol": "Van der Pol",
-    "lorenz": "Lorenz",
+# Merit -> title, format of a cell, and its width in inches.
+PANELS = {
+    "on_front": ("true equations on the front (%)", "{:.0f}", 0.36),
+    "selected": ("true equations selected (%)", "{:.0f}", 0.36),
+    "error_mean": ("error of the coefficients (%)", "{:.2g}", 0.5),
 }
-
-PANELS = {"on_front": "true equations on the front", "selected": "true equations selected"}
 
 MIN_WIDTH = 2.3  # of a heat map, in inches: its title stands above it
 
@@ -49,8 +47,8 @@ def merit_table(cells: pd.DataFrame, published: pd.DataFrame, merit: str) -> pd.
     counts become percentages of n.
     """
     place, shown = ["system", "noise"], ["variant", "system", "noise", merit, "n"]
-    known = published.merge(cells[[*place, "variant"]])
-    parts = {False: cells[shown], **({True: known[shown]} if len(known) else {})}
+    known = published.merge(cells[[*place, "variant"]]).reindex(columns=shown)
+    parts = {False: cells[shown], **({True: known} if len(known) else {})}
     both = pd.concat(parts, names=["published"]).reset_index("published")
     if merit in COUNTS:
         both[merit] *= 100.0 / both["n"]
@@ -65,11 +63,12 @@ def merit_table(cells: pd.DataFrame, published: pd.DataFrame, merit: str) -> pd.
 def frontier_figure(points: pd.DataFrame) -> Figure:
     """A panel per variant: sampling rate against duration, filled marks where it found the system.
 
-    points: variant, rate_Hz, duration_s, identified, reason.
+    points: variant, rate_Hz, duration_s, on_front of n, reason, of `studies.benchmark.cells`.
     """
     variants = list(points["variant"].unique())
     figure, axes = style.make_row(len(variants), width=2.6, height=3.5)
-    kinds = points["identified"].map({True: "identified", False: "not identified"})
+    identified = points["on_front"] == points["n"]
+    kinds = identified.map({True: "identified", False: "not identified"})
     kinds = kinds.where(points["reason"] == "", "too few samples to run")
     for ax, variant in zip(axes, variants, strict=True):
         for kind, sign in SIGNS.items():
@@ -84,18 +83,19 @@ def frontier_figure(points: pd.DataFrame) -> Figure:
 
 
 def benchmark_figure(cells: pd.DataFrame, *, thesis: pd.DataFrame) -> Figure:
-    """How often every variant finds the true equations, in percent, as numbers on a heat map.
+    """How right every variant is, in percent, as numbers on a heat map for each merit.
 
     cells, thesis: as for `merit_table`. The thesis's rows are in italics, each below its variant.
     """
-    tables = {merit: merit_table(cells, thesis, merit) for merit in PANELS}
-    rows, columns = tables["on_front"].axes
-    width = max(0.36 * len(columns), MIN_WIDTH)
-    size = (1.8 + 2 * (width + 0.1), 0.9 + 0.25 * len(rows))
-    figure, (axes,) = style.make_panels(1, len(PANELS), size, sharey=True)
+    tables = {merit: merit_table(cells, thesis, merit) for merit in PANELS if merit in cells}
+    rows, columns = next(iter(tables.values())).axes
+    width = max(*(PANELS[merit][2] * len(columns) for merit in tables), MIN_WIDTH)
+    size = (1.8 + len(tables) * (width + 0.1), 0.9 + 0.25 * len(rows))
+    figure, (axes,) = style.make_panels(1, len(tables), size, sharey=True)
     for ax, (merit, table) in zip(axes, tables.items(), strict=True):
-        _draw_heat_map(ax, table)
-        ax.set_title(f"{PANELS[merit]} (%)", fontsize=TITLE, pad=24)
+        title, form, _ = PANELS[merit]
+        _draw_heat_map(ax, table, form)
+        ax.set_title(title, fontsize=TITLE, pad=24)
     labels = ["thesis" if published else name.replace("_", " ") for name, published in rows]
     style.name_ticks(axes[0].yaxis, np.arange(len(rows)) + 0.5, labels)
     for text, (_, published) in zip(axes[0].get_yticklabels(), rows, strict=True):
@@ -103,7 +103,7 @@ def benchmark_figure(cells: pd.DataFrame, *, thesis: pd.DataFrame) -> Figure:
     return figure
 
 
-def _draw_heat_map(ax: Axes, table: pd.DataFrame) -> None:
+def _draw_heat_map(ax: Axes, table: pd.DataFrame, form: str) -> None:
     """Draw percentages as cells, with noise levels below the columns and system names above.
 
     A cell is blue by its value, and white if it has none.
@@ -117,7 +117,7 @@ def _draw_heat_map(ax: Axes, table: pd.DataFrame) -> None:
             ax.axhline(row, color="white", lw=3)  # gap between variants; thesis rows stay attached
         look: dict[str, Any] = {"style": "italic" if published else "normal", "fontsize": SMALL}
         for column, value in enumerate(values[row]):
-            text = "–" if np.isnan(value) else f"{value:.0f}"
+            text = "–" if np.isnan(value) else form.format(value)
             colour = "white" if scale(value) > DARK else "black"
             ax.text(column + 0.5, row + 0.5, text, color=colour, ha="center", va="center", **look)
     noises = [f"{100 * noise:g}" for noise in table.columns.get_level_values(1)]
@@ -126,6 +126,6 @@ def _draw_heat_map(ax: Axes, table: pd.DataFrame) -> None:
     ax.spines[:].set_visible(False)
     systems = table.columns.get_level_values(0)
     for system in systems.unique():
-        places, label = np.flatnonzero(systems == system), SYSTEM_LABELS.get(system, system)
+        places, label = np.flatnonzero(systems == system), system.replace("_", " ").title()
         ax.text(places.mean() + 0.5, -0.25, label, ha="center", va="bottom", fontsize=SMALL)
         ax.axvline(places[0], color="white", lw=5)

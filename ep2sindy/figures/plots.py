@@ -14,10 +14,9 @@ from matplotlib.figure import Figure
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.result import Discovery
-from ep2sindy.figures.free_run import cycle_figure, free_run_figure
 from ep2sindy.figures.fronts import front_figure
 from ep2sindy.figures.operating import cycle_figure as law_cycle_figure
-from ep2sindy.figures.series import data_figure
+from ep2sindy.figures.series import cycle_figure, data_figure, free_run_figure
 from ep2sindy.forecasting.evaluation import Evaluation
 from ep2sindy.model.stability import LimitCycle
 from ep2sindy.operating.law import OperatingLaw

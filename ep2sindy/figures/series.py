@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
 from ep2sindy.data.trajectory import Trajectory
@@ -25,9 +26,8 @@ from ep2sindy.figures.style import COLOURS, DATA, GREY, MORE_COLOURS, SMALL, TIT
 from ep2sindy.forecasting.forecast import LEVEL
 from ep2sindy.forecasting.skill import MODEL, ForecastSkill
 from ep2sindy.library.units import Clock, unit_product
-from ep2sindy.model.model import SparseModel
-from ep2sindy.model.rollout import Rollout
-from ep2sindy.signals.smoothers import Smoother
+from ep2sindy.model.rollout import Rollout, simulate
+from ep2sindy.model.stability import LimitCycle
 from ep2sindy.signals.spectrum import dominant_frequency, power_spectrum
 
 SINCE_START = "time since start of integration"
@@ -35,7 +35,10 @@ SINCE_START = "time since start of integration"
 HARMONICS = 10.0  # of the fastest state, up to which spectra are drawn
 
 LABEL = 18  # letters in a line of a model's label next to or above its panel
-RARE = 0.01  # fraction of derivative samples, low or high, kept out of the scale as edge spikes
+PERIODS = 6.0  # periods shown at either end of a record
+
+STARTS = (0.3, 0.6, 1.4, 0.6, 1.4)  # distance from the cycle's middle, relative to its states
+N_PERIODS = 12.0  # duration of a run from such a start, in periods
 
 
 def data_figure(run: Trajectory, *, duration_s: float, f_max_Hz: float | None = None) -> Figure:
@@ -78,46 +81,11 @@ def trajectory_figure(
     """
     data = first_part(run.t, run.states, duration_s, run.clock)
     models = _runs(rollouts, statuses, duration_s, run.clock)
-    titles = [style.axis_label(name, run.units[name]) for name in run.state_names]
-    x_label = _time_label(run.clock, duration_s, since)
-    return _draw_rows(data, models, titles, x_label, limits_of(data, models))
-
-
-def derivative_figure(
-    run: Trajectory, models: Mapping[str, SparseModel], *, smoother: Smoother, duration_s: float
-) -> Figure:
-    """A row per model: its right-hand side on the data (colour), the data's derivative (grey).
-
-    Spikes of the derivative do not set the scale.
-    """
-    clock, pieces = run.clock, run.segments()
-    slopes = np.concatenate([smoother.derivative(each.t, each.states) for each in pieces])
-    times = np.concatenate([each.t for each in pieces])
-    data = first_part(times, clock.seconds * slopes, duration_s, clock)
-    sides = []
-    for name, model in models.items():
-        slopes = model.derivative(run.columns(model.states), run.columns(model.inputs))
-        slopes = slopes[:, [model.states.index(state) for state in run.state_names]]
-        sides.append(first_part(run.t, clock.seconds * slopes, duration_s, clock, _label(name)))
-    titles = [style.slope_label(name, clock.rate_unit(run.units[name])) for name in run.state_names]
-    x_label, limits = _time_label(clock, duration_s), limits_of(data, sides, RARE)
-    return _draw_rows(data, sides, titles, x_label, limits)
-
-
-def _draw_rows(
-    data: Curves,
-    models: Sequence[Curves],
-    titles: Sequence[str],
-    x_label: str,
-    limits: Sequence[Limits],
-) -> Figure:
-    """Draw a row per model and a column per state, with the data in grey behind.
-
-    limits: of every column, which curves may leave.
-    """
+    n_states = len(run.state_names)
     height = float(np.clip(5.0 / len(models), 1.05, 2.2))
     size = (WIDTH, height * len(models) + 1.2)
-    figure, axes = style.make_panels(len(models), len(titles), size, sharex=True, sharey="col")
+    figure, axes = style.make_panels(len(models), n_states, size, sharex=True, sharey="col")
+    limits = limits_of(data, models)
     for row, colour, model in zip(axes, cycle(MORE_COLOURS), models, strict=False):
         for k, ax in enumerate(row):
             style.draw_over(ax, (data.x, data.y[:, k]), (model.x, model.y[:, k]), colour=colour)
@@ -126,9 +94,10 @@ def _draw_rows(
         row[0].set_ylabel(text, rotation=0, ha="right", va="center", labelpad=10)
     for ax in axes[1:].flat:  # panels of a column share their axis and so the first row's factor
         ax.yaxis.get_offset_text().set_visible(False)
-    for column, title in zip(axes.T, titles, strict=True):
-        column[0].set_title(title, fontsize=TITLE)
-    figure.supxlabel(x_label, fontsize=SMALL)  # once: three columns have no width for it
+    for column, name in zip(axes.T, run.state_names, strict=True):
+        column[0].set_title(style.axis_label(name, run.units[name]), fontsize=TITLE)
+    # Once: three columns have no width for it.
+    figure.supxlabel(_time_label(run.clock, duration_s, since), fontsize=SMALL)
     style.legend_above(figure, axes[0, 0].lines[:1])
     return figure
 
@@ -187,9 +156,9 @@ def _runs(
     ]
 
 
-def limits_of(data: Curves, models: Sequence[Curves], rare: float = 0.0) -> list[Limits]:
+def limits_of(data: Curves, models: Sequence[Curves]) -> list[Limits]:
     together = np.concatenate([curves.y for curves in models])
-    return [style.frame_limits(*pair, rare=rare) for pair in zip(data.y.T, together.T, strict=True)]
+    return [style.frame_limits(*pair) for pair in zip(data.y.T, together.T, strict=True)]
 
 
 def _run_label(name: str, run: Rollout, statuses: Mapping[str, str]) -> str:
@@ -295,3 +264,97 @@ def _draw_errors(ax: Axes, skill: ForecastSkill) -> None:
     ax.yaxis.set_major_formatter(FormatStrFormatter("%g"))
     ax.yaxis.set_minor_formatter(NullFormatter())
     ax.set_xlabel(f"horizon ({skill.unit})")
+
+
+def free_run_figure(run: Trajectory, rollout: Rollout, *, period_s: float) -> Figure:
+    """A row per state: the model over the data in the first and the last periods of a record.
+
+    run: the record; the model started from its first sample.
+    """
+    shown = min(PERIODS * period_s, 0.5 * float(run.t[-1] - run.t[0]))
+    factor, unit = run.clock.scale(shown)
+    n = len(run.state_names)
+    height = float(np.clip(5.0 / n, 1.3, 2.2))
+    figure, axes = style.make_panels(n, 2, (WIDTH, height * n + 0.8), sharex="col", sharey="row")
+    since = run.t - run.t[0]
+    parts = (since <= shown, since >= since[-1] - shown)
+    for k, (row, name) in enumerate(zip(axes, run.state_names, strict=True)):
+        model = rollout.states[:, rollout.state_names.index(name)]
+        for ax, part in zip(row, parts, strict=True):
+            reached = part & (np.arange(len(part)) < len(model))
+            data = factor * since[part], run.states[part, k]
+            style.draw_over(ax, data, (factor * since[reached], model[reached[: len(model)]]))
+        row[0].set_ylim(style.frame_limits(run.states[:, k], model))
+        row[0].set_ylabel(style.axis_label(name, run.units[name]))
+    for ax, words in zip(axes[0], ("first periods", "last periods"), strict=True):
+        ax.set_title(words, fontsize=TITLE)
+    for ax in axes[-1]:
+        ax.set_xlabel(f"time since the model's start ({unit})")
+    style.legend_above(figure, axes[0, 0].lines[:2])
+    return figure
+
+
+def cycle_figure(run: Trajectory | None, cycle: LimitCycle) -> Figure:
+    """A model's limit cycle over data in the plane of its first two states, and other runs.
+
+    run: the data; None leaves them out. Other runs start off the cycle, at the dots. A run that
+    leaves the panel is not drawn again. A neutral cycle is one of a family, and is called so.
+    """
+    own, others = "the model's cycle", "from other starts"
+    if cycle.stability == "neutral":
+        own, others = "the cycle from the record's start", "others of the family"
+    plane, paths = cycle.model.states[:2], paths_off(cycle)
+    figure, (ax,) = style.make_grid(1, width=4.4, height=3.8, extra=0.5)
+    handles = [
+        Line2D([], [], color=COLOURS[1], lw=2.0, label=own),
+        Line2D([], [], color=COLOURS[5], marker="o", ms=4, lw=0.8, label=others),
+    ]
+    closed = np.concatenate([cycle.states, cycle.states[:1]])[:, :2]
+    data = closed
+    if run is not None:
+        data = run.columns(plane)
+        ax.plot(*data.T, color=GREY, lw=0.6)
+        handles.insert(0, Line2D([], [], color=GREY, lw=2.0, label="data"))
+    for path in paths:
+        ax.plot(*path.states[:, :2].T, color=COLOURS[5], lw=0.7)
+        ax.plot(*path.states[0, :2], "o", color=COLOURS[5], ms=4)
+    ax.plot(*closed.T, color=COLOURS[1], lw=2.0)
+    shown = np.concatenate([closed, *(path.states[:1, :2] for path in paths)])
+    x_limits, y_limits = map(style.frame_limits, data.T, shown.T)
+    x_label, y_label = (style.axis_label(name, cycle.model.units[name]) for name in plane)
+    ax.set(xlim=x_limits, ylim=y_limits, xlabel=x_label, ylabel=y_label)
+    style.legend_above(figure, handles)
+    return figure
+
+
+def paths_off(cycle: LimitCycle) -> list[Rollout]:
+    """Runs of a cycle's model from states off it, some nearer to its middle and some farther."""
+    middle = cycle.states.mean(axis=0)
+    places = np.arange(len(STARTS)) * len(cycle.states) // len(STARTS)
+    starts = middle + np.array(STARTS)[:, None] * (cycle.states[places] - middle)
+    lowest = cycle.states.min(axis=0)  # of a state that is positive, no start may be below zero
+    starts = np.where(lowest > 0.0, np.maximum(starts, 0.5 * lowest), starts)
+    t = np.linspace(0.0, N_PERIODS * cycle.period_s, 1200)
+    reach = np.abs(cycle.states).max(axis=0)
+    return [simulate(cycle.model, t, start, None, blow_up=30.0, reach=reach) for start in starts]
+
+
+def balance_figure(
+    t: Float[np.ndarray, " samples"],
+    parts: Mapping[str, tuple[Float[np.ndarray, " samples"], Float[np.ndarray, " samples"]]],
+    *,
+    clock: Clock,
+) -> Figure:
+    """A panel per process: its rate in the record and by the model's terms, in m^-3/s."""
+    factor, unit = clock.scale(float(t[-1] - t[0]))
+    figure, axes = style.make_grid(
+        len(parts), width=WIDTH / 2, height=2.2, extra=0.6, sharex=True, x_label=f"time ({unit})"
+    )
+    time = factor * (t - t[0])
+    for ax, (name, (recorded, modelled)) in zip(axes, parts.items(), strict=True):
+        style.draw_over(ax, (time, recorded), (time, modelled))
+        ax.axhline(0.0, color=DATA, lw=0.5)
+        ax.set_title("\n".join(wrap(name, 44)), fontsize=TITLE)
+    figure.supylabel(style.axis_label("rate", "m^-3/s"), fontsize=TITLE)
+    style.legend_above(figure, axes[0].lines[:2])
+    return figure

@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import ScalarFormatter
 
-from ep2sindy.library.equations import latex_derivative, latex_name
+from ep2sindy.library.equations import latex_name
 
 DATA, GREY = "#222222", "#aaaaaa"
 
@@ -163,31 +163,21 @@ def sample_line(
     return line, np.column_stack(columns)
 
 
-def slope_label(name: str, unit: str) -> str:
-    """Label of the time derivative, with its unit."""
-    return f"${latex_derivative(name)}$ ({unit_text(unit)})"
-
-
 def unit_text(unit: str) -> str:
     """`m^-3 s^-1` as mathtext."""
     return re.sub(r"\^(-?[\d.]+)", r"$^{\1}$", unit)
 
 
 def frame_limits(
-    data: Float[np.ndarray, " samples"], models: Float[np.ndarray, " values"], *, rare: float = 0.0
+    data: Float[np.ndarray, " samples"], models: Float[np.ndarray, " values"]
 ) -> Limits:
     """Limits around data and models, within twice the data's range.
 
-    A model that runs away must not shrink the rest. rare: fraction of the lowest and of the highest
-    data that does not count for the range, such as spikes at a derivative's ends.
+    A model that runs away must not shrink the rest.
     """
-    values = np.sort(data)
-    n = min(int(np.ceil(rare * len(values))), (len(values) - 1) // 2)
-    low, high = float(values[n]), float(values[len(values) - 1 - n])
-    if low == high:
-        low, high = float(values[0]), float(values[-1])
+    low, high = float(data.min()), float(data.max())
     reach = 0.5 * (high - low)
-    everything = np.concatenate([values, models[np.isfinite(models)]])
+    everything = np.concatenate([data, models[np.isfinite(models)]])
     bottom = max(low - reach, float(everything.min()))
     top = min(high + reach, float(everything.max()))
     margin = 0.05 * (top - bottom) or 0.05 * abs(top) or 1.0

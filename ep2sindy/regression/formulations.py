@@ -449,10 +449,6 @@ class WeightedWeak:
             raise ValueError("weights need the noise: set weak.errors_in_variables to true")
         set_counts(self, {"n_steps": 0})
 
-    @property
-    def smoother(self) -> Smoother:
-        return self.weak.smoother
-
     def assemble(
         self, trajectories: Sequence[Trajectory], library: Library, *, rng: np.random.Generator
     ) -> tuple[RegressionRows, ...]:

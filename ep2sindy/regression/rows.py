@@ -15,7 +15,6 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.library import Library
 from ep2sindy.regression.windows import Windows
 from ep2sindy.runtime.values import locked, read_only
-from ep2sindy.signals.smoothers import Smoother
 from ep2sindy.trust.memory import check_memory
 
 # Rows of a regression, training and held-out, beyond which scaled copies are made block by block.
@@ -252,14 +251,7 @@ def _norms(
 
 @runtime_checkable
 class Formulation(Protocol):
-    """Interface that turns trajectories into regressions: one, or one per equation if rows differ.
-
-    smoother: smoother for the derivative of the samples, if any; figures of derivatives use it,
-    too.
-    """
-
-    @property
-    def smoother(self) -> Smoother | None: ...
+    """Turns trajectories into regressions: one, or one per equation if rows differ."""
 
     def assemble(
         self, trajectories: Sequence[Trajectory], library: Library, *, rng: np.random.Generator

@@ -16,7 +16,7 @@ from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ep2sindy.report.picture import DPI
+from ep2sindy.report.page import DPI
 from ep2sindy.runtime.files import sweep, write_bytes, write_json
 
 if TYPE_CHECKING:

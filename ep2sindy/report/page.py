@@ -9,23 +9,29 @@ from __future__ import annotations
 import html
 import re
 from base64 import b64encode
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree
 
 from ep2sindy.library.equations import latex_name, terms_latex
-from ep2sindy.report.about import About
 from ep2sindy.report.document import Block, Equation, Link, Result, Section, Table, Text, cell_text
-from ep2sindy.report.picture import Drawn
+from ep2sindy.runtime.files import read_bytes
 
 if TYPE_CHECKING:
     from jinja2 import Environment
     from markupsafe import Markup
+    from matplotlib.figure import Figure
 
 TEMPLATES = Path(__file__).parent / "templates"
 
 CHARACTERS = 100  # of text in a line of the page
+PX_PER_INCH = 96  # of a page: letters have the same size in all figures
+DPI = 150  # of figures in a run folder
+
+LARGE = 100_000  # bytes of a PNG from which a page holds it in 256 colours, a third of its size
 
 
 def page_html(
@@ -148,3 +154,125 @@ def mathml(latex: str) -> str:
         if each.text:
             each.text = html.unescape(each.text)  # signs come as entities, as in `&#x02212;`
     return ElementTree.tostring(element, encoding="unicode")
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A figure as HTML.
+
+    html: an element that needs no other file. width_px: intended width.
+    """
+
+    html: str
+    caption: str
+    width_px: int
+
+
+def draw(figure: Figure, png: bytes, caption: str) -> Drawn:
+    """A figure for a page, by its PNG."""
+    width = round(figure.get_size_inches()[0] * PX_PER_INCH)
+    return Drawn(png_html(in_few_colours(png) if len(png) > LARGE else png), caption, width)
+
+
+def in_few_colours(png: bytes) -> bytes:
+    """The image in its 256 most distinct colours, of which others differ by a few percent."""
+    from PIL import Image  # comes with matplotlib
+
+    buffer = BytesIO()
+    image = Image.open(BytesIO(png)).convert("RGB")
+    image.quantize(256, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(
+        buffer, "PNG"
+    )
+    return buffer.getvalue()
+
+
+def read_png(path: Path, caption: str) -> Drawn:
+    """A figure written by an earlier run. Raises ValueError for a file that is no PNG."""
+    png = read_bytes(path)
+    if not png.startswith(b"\x89PNG\r\n"):
+        raise ValueError(f"{path} must be a PNG, got {png[:8]!r}; take it out of the run's figures")
+    width = int.from_bytes(png[16:20], "big")  # width in the PNG header
+    return Drawn(png_html(png), caption, round(width / DPI * PX_PER_INCH))
+
+
+def png_html(png: bytes) -> str:
+    return f'<img alt="" src="data:image/png;base64,{b64encode(png).decode()}">'
+
+
+DATA = "data: "  # begins the message on what was read
+
+ASIDE = ("experiment", "study", "output", "figures", "thesis", "parallel")
+
+
+@dataclass(frozen=True)
+class About:
+    """Description of a run, for its page.
+
+    purpose: of the experiment, in a sentence. asked: settings in words, by name. messages: those
+    about the data and the steps of the run. provenance: as in provenance.json. config: the resolved
+    config, as text.
+    """
+
+    purpose: str
+    asked: Mapping[str, str]
+    messages: Sequence[str]
+    warnings: Sequence[str]
+    provenance: Mapping[str, Any]
+    config: str
+
+    @property
+    def data(self) -> str:
+        """What was read, in a line; empty if the run did not say it."""
+        return next((text for text in self.messages if text.startswith(DATA)), "")
+
+    @property
+    def notes(self) -> list[str]:
+        """All other messages."""
+        return [text for text in self.messages if text != self.data]
+
+    @property
+    def command(self) -> str:
+        """The command as typed in a shell, arguments quoted if necessary."""
+        from shlex import join
+
+        return join(self.provenance["command"])
+
+
+def settings_used(settings: Mapping[str, Any], keys: Collection[str]) -> dict[str, str]:
+    """The settings that a study uses, in words; unset ones are left out."""
+    used = {key: setting_text(settings[key]) for key in settings if key in {*keys} - {*ASIDE}}
+    return {key.replace("_", " "): text for key, text in used.items() if text}
+
+
+def setting_text(value: Any) -> str:
+    """Text of a setting, such as `BestSubset (max_terms 4, n_best 2)`; empty if it is not set."""
+    placed = by_place("", value)
+    name = placed.pop("", "")
+    parts = ", ".join(f"{at[1:]} {_number_text(each)}" for at, each in placed.items())
+    return f"{name} ({parts})" if name and parts else parts or _number_text(name)
+
+
+def _number_text(value: object) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def by_place(place: str, value: Any) -> dict[str, Any]:
+    """Settings by dotted key, `search: BestSubset, search.max_terms: 4`; without unset ones."""
+    if isinstance(value, Mapping):
+        if "name" in value and value["name"] is None:  # a variable missing in the file
+            return {}
+        name = str(value.get("_target_", "")).rpartition(".")[2]
+        found = {place: name} if name else {}
+        for key, each in value.items():
+            found |= by_place(f"{place}.{key}", each) if key != "_target_" else {}
+        return found
+    if isinstance(value, list):
+        between = "; " if any(isinstance(each, Mapping) for each in value) else ", "
+        return {place: between.join(map(setting_text, value))} if value else {}
+    return {place: value} if isinstance(value, int | float | str | bool) else {}
+
+
+def by_places(settings: Mapping[str, Any], keys: Collection[str]) -> dict[str, Any]:
+    """The settings of these keys, each by its dotted key, groups by their name."""
+    used = sorted({*keys} & {*settings} - {*ASIDE})
+    return {at: value for key in used for at, value in by_place(key, settings[key]).items()}

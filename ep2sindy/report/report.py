@@ -12,12 +12,10 @@ import pandas as pd
 from ep2sindy.library.relations import Constraint
 from ep2sindy.library.units import SECONDS, Clock
 from ep2sindy.model.model import SparseModel
-from ep2sindy.report.about import About, by_places, settings_used
 from ep2sindy.report.document import Block, Captioned, Picture, Result, Section, Table, Text
 from ep2sindy.report.folder import RunFolder
 from ep2sindy.report.models import coefficients, equations, interval_table, model_facts
-from ep2sindy.report.page import page_html
-from ep2sindy.report.picture import Drawn, draw
+from ep2sindy.report.page import About, Drawn, by_places, draw, page_html, settings_used
 from ep2sindy.report.results import TIMES, ResultTable, json_rows, on_clock
 from ep2sindy.report.screen import PAGE, Screen, renderables
 from ep2sindy.report.tensorboard import Board

@@ -28,7 +28,6 @@ LABELS = {
     "periods": "periods in phase",
     "r2": "R2",
     "r2_test": "R2 on held-out rows",
-    "identified_percent": "identified (%)",
     "d_pareto": "distance to the corner of the front",
 }
 

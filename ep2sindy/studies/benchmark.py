@@ -21,7 +21,6 @@ import pandas as pd
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.method import Finding
 from ep2sindy.figures.identified import COUNTS, MERITS, benchmark_figure, frontier_figure
-from ep2sindy.figures.windows import window_error_figure
 from ep2sindy.library.library import Library, named_terms
 from ep2sindy.library.relations import constraint
 from ep2sindy.regression.constrained import constrained_fit
@@ -30,7 +29,6 @@ from ep2sindy.report.document import Result, Text
 from ep2sindy.report.report import Report
 from ep2sindy.runtime.parallel import Workers, rows_in_order
 from ep2sindy.runtime.progress import SILENT, Progress
-from ep2sindy.studies.fitted import boxes_of
 from ep2sindy.studies.resume import resumed
 from ep2sindy.studies.study import A_LIST, Count, Deferred, Levels, Names, Positives
 from ep2sindy.systems.draws import check_systems, realization
@@ -38,13 +36,11 @@ from ep2sindy.systems.systems import System
 from ep2sindy.trust.user_code import nodes_of
 
 CAPTIONS = {
-    "benchmark": "Realizations in which all true equations are among the candidates (left), and "
-    "are the ones selected (right), in %. A dash: the variant selects nothing, or N/A in the "
-    "thesis.",
+    "benchmark": "Realizations in which all true equations are among the candidates, and are the "
+    "ones selected, in %; a dash: the variant selects nothing, or N/A in the thesis. Of forms of "
+    "the regression: ||beta - beta_true|| / ||beta_true|| over all equations, in %.",
     "frontier": "Filled: the true equations of all states are on the variant's fronts. Hollow: "
     "they are not. Cross: too few samples for the variant to run, which counts as not identified.",
-    "errors": "||beta - beta_true|| / ||beta_true|| over all equations against noise: a panel per "
-    "window length, a line per number of windows; black: the same forms in every panel.",
 }
 INTRODUCTION = (
     "A system that is named draws an initial state, or for the Van der Pol oscillator its "
@@ -53,28 +49,28 @@ INTRODUCTION = (
     "realization counts only if the equations of all states are right at once. Every variant sees "
     "the same realizations."
 )
-CELLS = (
+NOTE = (
     "on_front, selected: numbers of realizations, of n, whose true equations are on the front, and "
     "are the ones selected; mean_correct_terms: true terms among the selected, in the mean; "
     "cpu_s_per_search: of all equations of one realization, on one thread. thesis: its own "
-    "numbers, of 100 realizations."
+    "numbers, of 100 realizations. error_mean: of forms of the regression, in %; the terms are "
+    "known, and without noise the error is that of the integrals and derivatives."
 )
-ERRORS = (
-    "The terms of the equations are known, and least squares finds their coefficients. Without "
-    "noise the error is that of the integrals and derivatives."
-)
-SELECTED = {
-    "selected": "selected exactly right",
-    "on_front": "right on the front",
-    "identified": "identified",
+CELL = ("system", "noise", "variant")
+SAMPLING = ("variant", "rate_Hz", "duration_s", "reason")
+MEANS = ("mean_correct_terms", "error_mean", "cpu_s_per_search")
+# Headline of a variant, in % -> its words, and whether the largest is the best.
+VERDICTS = {
+    "selected_percent": ("selected exactly right", True),
+    "on_front_percent": ("right on the front", True),
+    "error_mean": ("mean error of the coefficients", False),
 }
 # Columns of `cells`: each from a column of the outcomes, if they have it.
 AGGREGATES: Mapping[str, tuple[str, Any]] = {
     "on_front": ("on_front", "sum"),
     "selected": ("selected", lambda s: s.sum(min_count=1)),
     "mean_correct_terms": ("correct_terms", "mean"),
-    "error_mean": ("error", "mean"),
-    "error_std": ("error", "std"),
+    "error_mean": ("error", lambda s: 100.0 * s.mean()),
     "n": ("cpu_s", "size"),
     "cpu_s_per_search": ("cpu_s", "median"),
 }
@@ -192,12 +188,7 @@ class Study:
                 f"{self.n_realizations or 1}.",
                 Text(INTRODUCTION, page_only=True),
             )
-            if "error" in outcomes:
-                add_errors(report, outcomes, variants)
-            elif {"rate_Hz", "duration_s"} <= {*outcomes}:
-                add_frontier(report, outcomes)
-            else:
-                add_counts(report, outcomes)
+            add_cells(report, outcomes)
         report.section("Variants")
         report.add(*(Text(f"{name}: {each}", page_only=True) for name, each in variants.items()))
 
@@ -261,12 +252,10 @@ def assessed(
     return rows
 
 
-def cells(
-    outcomes: pd.DataFrame, by: Sequence[str] = ("system", "noise", "variant")
-) -> pd.DataFrame:
+def cells(outcomes: pd.DataFrame, by: Sequence[str] = CELL) -> pd.DataFrame:
     """Counts and means over all realizations, one row for each value of the columns `by`.
 
-    on_front, selected: numbers of realizations. mean_correct_terms, error_mean, error_std: over the
+    on_front, selected: numbers of realizations. mean_correct_terms, error_mean (in %): over the
     realizations. n: number of realizations. cpu_s_per_search: the median, so that compilation
     during the first search does not count.
     """
@@ -287,88 +276,60 @@ def published_cells() -> pd.DataFrame:
     return table.assign(n=100)
 
 
-def add_counts(report: Report, outcomes: pd.DataFrame) -> None:
-    """Add how often every variant is right, by system and noise, next to the thesis's numbers."""
-    counted, published = cells(outcomes), published_cells()
-    draw = partial(benchmark_figure, counted, thesis=published)
-    report.figure("benchmark", draw, CAPTIONS["benchmark"])
-    keys, columns = ["system", "noise", "variant"], {merit: f"thesis_{merit}" for merit in MERITS}
-    beside = published.rename(columns=columns)[[*keys, *columns.values()]]
-    beside = counted.astype(dict.fromkeys(COUNTS, "Int64")).merge(beside, how="left", on=keys)
+def add_cells(report: Report, outcomes: pd.DataFrame) -> None:
+    """Add how right every variant is, by system and noise, or by sampling rate and duration."""
+    is_map = {"rate_Hz", "duration_s"} <= {*outcomes}
+    found = cells(outcomes, SAMPLING if is_map else CELL)
+    name = "frontier" if is_map else "benchmark"
+    published = published_cells()
+    draw = partial(benchmark_figure, found, thesis=published)
+    report.figure(name, partial(frontier_figure, found) if is_map else draw, CAPTIONS[name])
     report.samples("outcomes", outcomes)
-    report.section("By system and noise")
-    report.table("cells", beside, note=CELLS, page_only=True)
-    for name, rows in counted.groupby("variant", sort=False):
-        report.headline[f"{name}/mean_correct_terms"] = float(rows["mean_correct_terms"].mean())
-        report.headline[f"{name}/cpu_ms"] = float(1e3 * rows["cpu_s_per_search"].mean())
-    conclude(report, counted, picture="benchmark", table="cells")
+    report.section("Every cell")
+    rows = found if is_map else beside_thesis(found, published)
+    report.table("cells", rows, note=NOTE, shown=not is_map, page_only=True)
+    numbers = {str(n): headline_of(rows) for n, rows in found.groupby("variant", sort=False)}
+    report.headline |= {f"{n}/{key}": v for n, each in numbers.items() for key, v in each.items()}
+    conclude(report, pd.DataFrame(numbers).T, picture=name)
+    if is_map:
+        few = found[found["reason"] != ""].groupby("variant", sort=False).size()
+        counts = ", ".join(f"{variant} {n}" for variant, n in few.items()) or "none"
+        report.add(f"Cells with too few samples to run: {counts}; tables/cells.csv says why.")
 
 
-def add_frontier(report: Report, outcomes: pd.DataFrame) -> None:
-    """Add at which sampling rates and durations every variant has the equations on its fronts."""
-    found = cells(outcomes, ["variant", "rate_Hz", "duration_s", "reason"])
-    # By variant, from the smallest on.
-    points = pd.concat([each[::-1] for _, each in found.groupby("variant", sort=False)])
-    points["n_samples"] = (points["rate_Hz"] * points["duration_s"]).round().astype(int)
-    points["identified"] = points["on_front"] == points["n"]
-    points = points[["variant", "rate_Hz", "duration_s", "n_samples", "identified", "reason"]]
-    few = points[points["reason"] != ""].groupby("variant", sort=False).size()
-    counts = ", ".join(f"{variant} {n}" for variant, n in few.items())
-    systems = ", ".join(outcomes["system"].unique())
-    few_words = f"Too few samples to run: {counts or 'none'}; tables/points.csv says why."
-    report.add(f"{systems}, at {len(points) // points['variant'].nunique()} points. {few_words}")
-    report.figure("frontier", partial(frontier_figure, points), CAPTIONS["frontier"])
-    report.table("points", points, shown=False)
-    of = f"rates and durations of {systems}"
-    conclude(report, points.assign(n=1), of, picture="frontier", table="points")
+def beside_thesis(found: pd.DataFrame, published: pd.DataFrame) -> pd.DataFrame:
+    """The cells with the thesis's numbers, where it has the variants, in further columns."""
+    if "on_front" not in found:
+        return found
+    columns = {merit: f"thesis_{merit}" for merit in MERITS}
+    beside = published.rename(columns=columns)[[*CELL, *columns.values()]]
+    return found.astype(dict.fromkeys(COUNTS, "Int64")).merge(beside, how="left", on=[*CELL])
 
 
-def conclude(
-    report: Report, counted: pd.DataFrame, of: str = "realizations", *, picture: str, table: str
-) -> None:
-    """Say which variant is right most often; a variant that selects nothing has 0 % selected."""
-    there = [merit for merit in SELECTED if merit in counted]
-    for name, rows in counted.groupby("variant", sort=False):
-        for merit in there:
-            share = 100.0 * rows[merit].sum() / rows["n"].sum()
-            report.headline[f"{name}/{merit}_percent"] = float(share)
-    merit = next(each for each in there if counted[each].notna().any())
-    known = counted.dropna(subset=[merit]).groupby("variant", sort=False)[[merit, "n"]].sum()
-    percent = 100 * known[merit] / known["n"]
-    best = str(percent.idxmax())
-    title = f"{best}, {SELECTED[merit]} in {percent[best]:.0f} % of {int(known['n'][best])}"
-    fractions = "; ".join(f"{name} {value:.0f} %" for name, value in percent.items())
-    _found(report, f"{title} {of}", f"{SELECTED[merit]}: {fractions}", picture, table)
+def headline_of(rows: pd.DataFrame) -> dict[str, float]:
+    """Numbers of one variant over all its cells; NaN for what it does not do, such as to select."""
+    n, counted = rows["n"].sum(), [merit for merit in COUNTS if merit in rows]
+    percent = {f"{merit}_percent": 100.0 * rows[merit].sum(min_count=1) / n for merit in counted}
+    means = {key: rows[key].mean() for key in MEANS if key in rows}
+    return {key: float(value) for key, value in (percent | means).items()}
 
 
-def add_errors(report: Report, outcomes: pd.DataFrame, forms: Ways) -> None:
-    """Add the mean error of the coefficients in every form, by noise."""
-    means = error_cells(outcomes, forms)
-    report.figure("errors", partial(window_error_figure, means), CAPTIONS["errors"])
-    report.section("Coefficient error, mean over the realizations")
-    report.table("cells", means, note=ERRORS)
-    report.samples("errors", outcomes.rename(columns={"variant": "fit"}))
-    for row in means.to_dict("records"):
-        report.headline[f"{row['fit']}/error_{100 * row['noise']:g}_percent"] = row["error_mean"]
-    least = means.loc[means.groupby("noise")["error_mean"].idxmin()].to_dict("records")
-    lines = "; ".join(
-        f"{100 * row['noise']:g} % noise: {row['fit']}, {100 * row['error_mean']:.2g} %"
-        for row in least
+def conclude(report: Report, numbers: pd.DataFrame, *, picture: str) -> None:
+    """Say which variant is best. numbers: of `headline_of`, a row per variant."""
+    there = [key for key in VERDICTS if key in numbers and numbers[key].notna().any()]
+    words, largest = VERDICTS[there[0]]
+    known = numbers[there[0]].dropna()
+    best = str(known.idxmax() if largest else known.idxmin())
+    lines = [
+        f"{VERDICTS[key][0]}: "
+        + "; ".join(f"{name} {value:.3g} %" for name, value in numbers[key].dropna().items())
+        for key in there
+    ]
+    report.found(
+        Result(
+            f"{best}, {words}: {known[best]:.3g} %",
+            [Text(line) for line in lines],
+            load='pandas.read_csv("{}/tables/cells.csv")',
+            picture=picture,
+        )
     )
-    title = f"the windows of least error for {', '.join(outcomes['system'].unique())}"
-    _found(report, title, f"error of the coefficients in the mean: {lines}", "errors", "cells")
-
-
-def error_cells(outcomes: pd.DataFrame, forms: Ways) -> pd.DataFrame:
-    """`cells` of forms by noise. n_windows, n_points: missing for forms without random windows."""
-    means = cells(outcomes, ["variant", "noise"]).rename(columns={"variant": "fit"})
-    boxes = [boxes_of(forms[name]) for name in means["fit"]]
-    for place, key in enumerate(("n_windows", "n_points"), start=1):
-        values = [getattr(box, key) if box else None for box in boxes]
-        means.insert(place, key, pd.Series(values, dtype="Int64"))
-    return means
-
-
-def _found(report: Report, title: str, details: str, picture: str, table: str) -> None:
-    load = f'pandas.read_csv("{{}}/tables/{table}.csv")'
-    report.found(Result(title, [Text(details)], load=load, picture=picture))

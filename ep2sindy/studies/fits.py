@@ -17,15 +17,15 @@ import numpy as np
 import pandas as pd
 
 from ep2sindy.data.trajectory import ConstantStateError, Trajectory
-from ep2sindy.figures.windows import loss_against_window_figure
+from ep2sindy.figures.fits import loss_against_window_figure, sustained_figure
 from ep2sindy.forecasting.evaluation import Evaluation, evaluate
 from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Constraint
-from ep2sindy.model.comparison import samples_in
+from ep2sindy.model.comparison import Status, samples_in
 from ep2sindy.model.model import SparseModel
 from ep2sindy.refinement.windows import MIN_SAMPLES
 from ep2sindy.regression.rows import Formulation
-from ep2sindy.report.document import Text
+from ep2sindy.report.document import Result, Text
 from ep2sindy.report.models import equations, interval_table
 from ep2sindy.report.report import Report
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View
@@ -33,34 +33,33 @@ from ep2sindy.runtime.progress import count_pieces
 from ep2sindy.signals.spectrum import dominant_frequency
 from ep2sindy.studies.fitted import (
     FITTED,
+    SEVERAL,
+    SEVERAL_NOTE,
     STARTED,
     FirstModel,
     Fit,
     Fitted,
     RecordParts,
     Way,
-    ends,
-    expand,
+    count_words,
     first_model,
     fitted_start,
     n_sustained,
+    ways_of,
     worst_amplitude,
     wrong_signs,
 )
-from ep2sindy.studies.over_points import add_points
 from ep2sindy.studies.point_sources import Points, given_points
 from ep2sindy.studies.processes import Zones
 from ep2sindy.studies.source import DivergedError, Source, split_in_time, zones_of
 from ep2sindy.studies.structures import Structures
 from ep2sindy.studies.study import Count, Fraction, Positive, PositiveOrAll, ZeroOrMore
 from ep2sindy.studies.views import (
-    EVALUATION,
     PlotRange,
     add_figures,
     add_samples,
     best_run,
     found_model,
-    largest,
 )
 
 if TYPE_CHECKING:
@@ -76,10 +75,18 @@ NOTE = (
     "the first one and a half periods, since a single sample may lie off every orbit of the model; "
     "r2: of the derivative, on the rows of the fit, which windows average."
 )
-CAPTION = (
+WINDOWS_CAPTION = (
     "Refinement with windows of several lengths: loss on the fitted part, where each window has a "
     "start of its own; frequency error and nrmse of the run, from its first sample (full) "
     "and from a fitted start (dashed). The dotted line marks one period, the grey one 1 %."
+)
+POINTS_NOTE = (
+    f"{SEVERAL_NOTE} Signs wrong: terms whose sign contradicts the recorded balance of the same "
+    "process, and at how many points."
+)
+POINTS_CAPTION = (
+    "What becomes of every model, run freely from one sample at every operating point, by the way "
+    "its coefficients were found. Colour: error of the amplitude of the state that is farthest off."
 )
 BEST = "of {} fits, the one that runs best: by its status, and then by its distance to the data"
 FIGURES = ("trajectories", "phase")
@@ -126,7 +133,7 @@ class Study:
 
     @cached_property
     def _ways(self) -> list[Way]:
-        return expand(self.fits, self.forms, self.formulation)
+        return ways_of(self.fits, self.forms, self.formulation)
 
     @cached_property
     def _libraries(self) -> dict[str, Library]:
@@ -188,7 +195,7 @@ class Study:
         pieces = [
             (name, way)
             for (name, structure), way in product(self.models.items(), self._ways)
-            if structure.fits is None or way.of in structure.fits
+            if structure.fits is None or way.name in structure.fits
         ]
         found = {}
         for name, way in count_pieces(report.watch, pieces, "fit", record.data.label):
@@ -290,10 +297,8 @@ class Study:
                 row: dict[str, Any] = {
                     "fit": name,
                     "window": length,
-                    "periods": (length - 1) / period,
                     "loss": found.loss,
                     "status": str(found.status),
-                    "text": found.model.text(),
                 }
                 for end in ("", STARTED):
                     run = self._evaluate(found.model, record, started=bool(end))
@@ -303,7 +308,7 @@ class Study:
         report.section("Loss against window length")
         report.table("loss_against_window", table, shown=False)
         draw = partial(loss_against_window_figure, table, period=period)
-        report.figure("loss_against_window", draw, CAPTION)
+        report.figure("loss_against_window", draw, WINDOWS_CAPTION)
 
     def _add_draws(self, fits: Mapping[str, Fitted], record: RecordParts, report: Report) -> None:
         """How far the runs from the first sample depend on the draw of windows."""
@@ -312,37 +317,13 @@ class Study:
             seeds = count_pieces(report.watch, range(self.n_draws), "draw", name)
             refinements = [self._refine(each.first, record, report, seed=seed) for seed in seeds]
             draws[name] = [self._evaluate(found.model, record) for found in refinements]
-        rows = {f"{name}, {k}": run for name, runs in draws.items() for k, run in enumerate(runs)}
-        report.samples("draws", ResultTable(rows, EVALUATION).csv("draw"))
         report.section(f"Over {self.n_draws} draws of windows")
         report.table(
             "spread",
-            ResultTable(draws, SPREAD),
+            ResultTable(draws, SEVERAL),
             heading="fit",
-            title="lowest and highest, from the first sample",
-            note="Amplitude and waveform are those of the state that is farthest off.",
+            note=SEVERAL_NOTE,
         )
-
-
-def _range(ends: Sequence[float], form: str = "{:.3f} to {:.3f}", factor: float = 1.0) -> str:
-    low, high = (factor * value for value in ends)
-    return "-" if np.isnan(low) else form.format(low, high)
-
-
-_PERCENT = partial(_range, form="{:+.2f} to {:+.2f} %", factor=100.0)
-SPREAD: Metrics[Sequence[Evaluation]] = [
-    Metric("n_draws", len),
-    Metric("n_sustained", n_sustained, View.SHOWN, "sustained"),
-    Metric("f_error", partial(ends, lambda run: run.f_error), View.SHOWN, format=_PERCENT),
-    Metric("nrmse", partial(ends, lambda run: run.nrmse), View.SHOWN, format=_range),
-    Metric("amplitude", partial(ends, worst_amplitude), View.SHOWN, format=_range),
-    Metric(
-        "waveform",
-        partial(ends, lambda run: largest(run.waveform_error)),
-        View.SHOWN,
-        format=_range,
-    ),
-]
 
 
 def watcher(
@@ -368,3 +349,75 @@ def watcher(
         tell(scalars, step=next(steps))
 
     return watch
+
+
+def _runs(fits: Sequence[Fitted]) -> list[Evaluation]:
+    return [fit.from_sample for fit in fits]
+
+
+AT_POINTS: Metrics[Sequence[Fitted]] = [
+    Metric("n_free", lambda fits: max(fit.n_free for fit in fits), View.SHOWN, "free"),
+    *(metric.of(_runs) for metric in SEVERAL),
+    Metric(
+        "wrong_signs", lambda fits: count_words([t for fit in fits for t in fit.wrong], "; "),
+        View.SHOWN, "signs wrong",
+    ),
+    Metric("source", lambda fits: fits[0].structure.source),
+]  # fmt: skip
+
+
+def add_points(
+    found: Mapping[str, Mapping[str, Fitted]], labels: Mapping[str, str], report: Report
+) -> None:
+    """Every fit over all points, and the models of each point.
+
+    found: by point, then by fit. labels: of parameters, for the figure.
+    Raises ValueError if no point has a record.
+    """
+    if not found:
+        raise ValueError("structures need a record to be fitted to: no operating point has one")
+    first = next(iter(found.values()))
+    over = {name: [fits[name] for fits in found.values()] for name in first}
+    sources = {fit.name: fit.structure.source for fit in first.values()}
+    report.section(f"{len(over)} fits at {len(found)} operating points")
+    draw = partial(sustained_figure, _rows(found), labels=labels)
+    report.figure("sustained", draw, POINTS_CAPTION)
+    report.table("over_points", ResultTable(over, AT_POINTS), heading="fit", note=POINTS_NOTE)
+    report.section("Structures", *(f"{key}: {text}" for key, text in sources.items() if text))
+    rows = {f"{n}, {p}": fit for n in over for p, fit in zip(found, over[n], strict=True)}
+    report.section("Every point")
+    report.table("fits", ResultTable(rows, FITTED), heading="fit", page_only=True)
+    for number, (point, fits) in enumerate(found.items()):
+        report.section(point, level=3)
+        for name, fit in fits.items():
+            held_to = fit.first.held_to
+            report.add(*equations(fit.model, held=held_to, lead=name, on_screen=False))
+            report.model(f"{name}_{number}", fit.model, held=held_to, shown=False)
+    counts = {name: n_sustained(_runs(fits)) for name, fits in over.items()}
+    lines = [
+        Text(f"fits that sustain it at {n} of {len(found)} points: {', '.join(names)}")
+        for n in range(len(found), 0, -1)
+        if (names := [name for name, count in counts.items() if count == n])
+    ]
+    structures = {over[name][0].name for name, n in counts.items() if n == len(found)}
+    report.found(
+        Result(
+            f"{len(structures)} of {len(sources)} structures sustain the oscillation at all "
+            f"{len(found)} points",
+            lines or [Text("no fit sustains the oscillation at any point")],
+            load='pandas.read_csv("{}/tables/over_points.csv")',
+            picture="sustained",
+        )
+    )
+
+
+def _rows(found: Mapping[str, Mapping[str, Fitted]]) -> pd.DataFrame:
+    """One row per structure, way and point: what the figure draws."""
+    rows = [
+        (fit.name, fit.way.name, point,
+         str(Status.SUSTAINED if fit.from_sample.holds else fit.from_sample.status),
+         abs(worst_amplitude(fit.from_sample) - 1.0))
+        for point, fits in found.items()
+        for fit in fits.values()
+    ]  # fmt: skip
+    return pd.DataFrame(rows, columns=["structure", "way", "point", "status", "amplitude_error"])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,13 +19,11 @@ from ep2sindy.model.model import SparseModel
 from ep2sindy.model.restarts import Restarts
 from ep2sindy.refinement.windows import dominant_window
 from ep2sindy.regression.constrained import constrained_fit, rows_r2
-from ep2sindy.regression.formulations import Weak
 from ep2sindy.regression.rows import Formulation
-from ep2sindy.regression.windows import Boxes
 from ep2sindy.report.results import Metric, Metrics, View
 from ep2sindy.studies.processes import Zones, compared_processes
 from ep2sindy.studies.structures import Structure, balance_model
-from ep2sindy.studies.views import EVALUATION
+from ep2sindy.studies.views import EVALUATION, largest
 
 if TYPE_CHECKING:
     from ep2sindy.refinement.refine import Refinement
@@ -40,63 +38,37 @@ class Fit:
 
     form: of the regression, one of those that the config names; None means the formulation;
     "balance" fits every process to the rate that a simulation records. relations: whether those of
-    a structure hold. refine: whether trajectories are followed then. n_points, n_windows: of random
-    windows, for a form that has them; every combination is a fit of its own, `n_points_70`.
+    a structure hold. refine: whether trajectories are followed then.
     """
 
     form: str | None = None
     relations: bool = True
     refine: bool = False
-    n_points: Sequence[int] = ()
-    n_windows: Sequence[int] = ()
 
 
 @dataclass(frozen=True)
 class Way:
-    """One fit with its form; None means the recorded balance. of: the config's name of the fit."""
+    """One fit with its form; None means the recorded balance."""
 
     name: str
-    of: str
     fit: Fit
     form: Formulation | None
 
 
-def expand(
+def ways_of(
     fits: Mapping[str, Fit], forms: Mapping[str, Formulation], usual: Formulation
 ) -> list[Way]:
-    """Every fit with its form, one for each number and length of windows.
-
-    Raises ValueError for a form that is not named, or without random windows where such are asked.
-    """
-    found = []
+    """Every fit with its form. Raises ValueError for a form that is not named."""
     for name, fit in fits.items():
         if fit.form not in (None, BALANCE, *forms):
             raise ValueError(
                 f"fits.{name}.form must be null, {BALANCE} or one of {list(forms)}: got "
                 f"{fit.form!r}"
             )
-        form = usual if fit.form is None else forms.get(fit.form)
-        if not (fit.n_points or fit.n_windows):
-            found.append(Way(name, name, fit, form))
-            continue
-        if not isinstance(form, Weak) or (own := boxes_of(form)) is None:
-            raise ValueError(
-                f"fits.{name}.n_points and n_windows are for a form of random windows (Weak with "
-                f"Boxes): got {form}"
-            )
-        numbers, lengths = fit.n_windows or [own.n_windows], fit.n_points or [own.n_points]
-        for n_windows, n_points in product(numbers, lengths):
-            boxes = replace(own, n_points=n_points, n_windows=n_windows)
-            varied = f"n_windows_{n_windows}_" if len(fit.n_windows) > 1 else ""
-            its_form = replace(form, test_functions=boxes)
-            found.append(Way(f"{varied}n_points_{n_points}", name, fit, its_form))
-    return found
-
-
-def boxes_of(form: object) -> Boxes | None:
-    """The random windows of a form; None if it has none."""
-    functions = form.test_functions if isinstance(form, Weak) else None
-    return functions if isinstance(functions, Boxes) else None
+    return [
+        Way(name, fit, usual if fit.form is None else forms.get(fit.form))
+        for name, fit in fits.items()
+    ]
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,7 +182,7 @@ def wrong_signs(model: SparseModel, held_to: Constraint | None, record: RecordPa
     ]
 
 
-# Several runs of one kind: over draws of windows, or over operating points.
+# Several runs of one fit: over draws of windows, or over operating points.
 
 
 def ends(value: Callable[[Evaluation], float], runs: Sequence[Evaluation]) -> list[float]:
@@ -227,3 +199,36 @@ def n_sustained(runs: Sequence[Evaluation]) -> int:
 def worst_amplitude(run: Evaluation) -> float:
     """Amplitude over the data's, of the state that is farthest off."""
     return max(run.amplitude_ratio.values(), key=lambda ratio: abs(ratio - 1.0))
+
+
+def count_words(words: Sequence[str], between: str) -> str:
+    """`decays at 2, diverges at 1`: how often each of the words comes."""
+    return between.join(f"{word} at {words.count(word)}" for word in dict.fromkeys(words))
+
+
+def _range(ends: Sequence[float], form: str = "{:.3f} to {:.3f}", factor: float = 1.0) -> str:
+    low, high = (factor * value for value in ends)
+    return "-" if np.isnan(low) else form.format(low, high)
+
+
+_PERCENT = partial(_range, form="{:+.2f} to {:+.2f} %", factor=100.0)
+SEVERAL: Metrics[Sequence[Evaluation]] = [
+    Metric("n_runs", len),
+    Metric("n_sustained", n_sustained, View.FILES | View.HEADLINE),
+    Metric("sustained", lambda runs: f"{n_sustained(runs)} of {len(runs)}", View.SCREEN),
+    Metric(
+        "elsewhere", lambda runs: count_words([str(r.status) for r in runs if not r.holds], ", "),
+        View.SHOWN,
+    ),
+    Metric("f_error", partial(ends, lambda run: run.f_error), View.SHOWN, format=_PERCENT),
+    Metric("nrmse", partial(ends, lambda run: run.nrmse)),
+    Metric("amplitude", partial(ends, worst_amplitude), View.SHOWN, format=_range),
+    Metric(
+        "waveform", partial(ends, lambda run: largest(run.waveform_error)), View.SHOWN,
+        format=_range,
+    ),
+]  # fmt: skip
+SEVERAL_NOTE = (
+    "Lowest and highest, from the first sample, where the model has a cycle; amplitude (times the "
+    "data's) and waveform are those of the state that is farthest off."
+)

@@ -32,11 +32,10 @@ from ep2sindy.selection.criteria import Knee
 from ep2sindy.signals.attractor import find_cycle
 from ep2sindy.signals.driving import DRIVE, add_drive, ask_whether_driven, drop_repeats
 from ep2sindy.signals.signal import average_long, prepare_signal
-from ep2sindy.studies.balance import ModelBalance, add_balance, model_balance
-from ep2sindy.studies.candidates import add_candidates, add_estimate
-from ep2sindy.studies.forecasts import add_forecasts, skill_of, why_none
-from ep2sindy.studies.library_result import (
+from ep2sindy.studies.discoveries import (
     LibraryResult,
+    add_candidates,
+    add_estimate,
     add_evaluations,
     add_tables,
     find_best,
@@ -44,22 +43,31 @@ from ep2sindy.studies.library_result import (
     refitted_model,
 )
 from ep2sindy.studies.point_sources import Points
-from ep2sindy.studies.processes import NO_ZONES, Zones
+from ep2sindy.studies.processes import NO_ZONES, ComparedProcess, Zones
 from ep2sindy.studies.source import Source, columns_beside, n_before, split_in_time, zones_of
 from ep2sindy.studies.study import Coefficients, Fraction, PositiveOrAll, Terms, ZeroOrMore
 from ep2sindy.studies.sustained import (
     SustainedModel,
     SustainedSearch,
+    add_balance,
     add_sustained,
+    model_balance,
     start_of,
 )
-from ep2sindy.studies.views import PlotRange, add_figures, add_samples
+from ep2sindy.studies.views import (
+    PlotRange,
+    add_figures,
+    add_forecasts,
+    add_samples,
+    skill_of,
+    why_none,
+)
 from ep2sindy.trust.user_code import load_user_module
 
 if TYPE_CHECKING:
     from ep2sindy.studies.points import Study as OverPoints
 
-FIGURES = ("data", "trajectories", "derivatives", "phase")
+FIGURES = ("data", "trajectories", "phase")
 HELD_OUT = 0.25  # fraction of a record that tests self-sustained models, unless a config says
 _FROM_MODULE = re.compile(r"(?P<module>[^\W\d][\w.]*)\.(?P<name>[^\W\d]\w*)(?P<argument>\(.*\))?")
 
@@ -278,9 +286,9 @@ class Study:
         n_samples = [run.n_samples if s is None else samples_in(run, s) for run in runs]
         refitted = refit(found, thesis, self.formulation, runs, rng)
         published = refitted_model(found, refitted)
-        sustained = beside = None
+        sustained, processes = None, list[ComparedProcess]()
         if self.sustained is not None and not found.model.inputs:
-            sustained, beside = self._sustain(
+            sustained, processes = self._sustain(
                 self.sustained, runs[0], library, zones, rng=rng, progress=progress
             )
         skill = skill_of(
@@ -299,25 +307,22 @@ class Study:
                 refitted=refitted,
                 published=None if published is None else over[0](published),
                 sustained=sustained,
-                balance=beside,
+                processes=processes,
                 skill=skill,
             )
 
     def _sustain(
         self, settings: SustainedSearch, run: Trajectory, library: Library, zones: Zones, *,
         rng: np.random.Generator, progress: Progress,
-    ) -> tuple[SustainedModel, ModelBalance]:  # fmt: skip
-        """The self-sustained model of a record, and the balance of its terms."""
+    ) -> tuple[SustainedModel, list[ComparedProcess]]:  # fmt: skip
+        """The self-sustained model of a record, and its processes next to the recorded ones."""
         rows = Regression(self.formulation, bootstraps=self.bootstraps)
         train, held = split_in_time(run, self.held_out or HELD_OUT)
         found = settings.found(train, library, rows, zones, rng=rng, progress=progress)
         model, bounds = found.model, settings.bounds
         with progress.stage(None, "", "free run"):
             free = evaluate(model, held, initial=start_of(held, model), bounds=bounds)
-        beside = model_balance(
-            model, found.constraint, run, train, held, zones, bounds, progress=progress
-        )
-        return SustainedModel(found, free), beside
+        return SustainedModel(found, free), model_balance(model, found.constraint, run, zones)
 
     def _tell(
         self,
@@ -330,9 +335,11 @@ class Study:
         report.found(find_best(results, len(files)))
         add_evaluations(report, results, files)
         for name, result in results.items():
-            if result.sustained is not None and result.balance is not None:
+            if result.sustained is not None:
                 add_sustained(report, name, result.sustained)
-                add_balance(report, name, result.balance, data, result.sustained.run.cycle)
+                if result.processes:
+                    cycle = result.sustained.run.cycle
+                    add_balance(report, name, result.processes, data, cycle)
             if result.skill is not None:
                 where = "seen by the search" if result.sustained is None else "held out"
                 title = f"{name}: forecasts over time {where}"
@@ -352,13 +359,12 @@ class Study:
         clock, figures = data.clock, partial(add_figures, report, data=data, shown=self.figures)
         report.section("The selected model" if len(results) == 1 else "The selected models")
         for name, result in results.items():
-            text = f"{name}: equations {result.how}; run freely: {result.runs[0].text}"
-            report.add(Text(text, page_only=True))
+            report.add(Text(f"{name}, run freely: {result.runs[0].text}", page_only=True))
             held = result.discovery.constraint
             report.model(name, result.discovery.model, clock=clock, held=held)
         selected = {name: result.runs[0] for name, result in results.items()}
         published = {f"{n}_thesis_terms": r.published for n, r in results.items() if r.published}
-        figures(FIGURES, runs=selected, smoother=self.formulation.smoother)
+        figures(FIGURES, runs=selected)
         add_samples(report, data, selected | published)
         for name, run in published.items():
             report.model(name, run.model, clock=clock, shown=False)

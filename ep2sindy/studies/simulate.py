@@ -10,32 +10,29 @@ from operator import itemgetter
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import xarray as xr
 
+from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.figures import breathing
+from ep2sindy.figures.series import data_figure
 from ep2sindy.report.document import Result, Table, Text, places
 from ep2sindy.report.report import Report
 from ep2sindy.report.results import Metric, ResultTable, View, percent
-from ep2sindy.signals.spectrum import power_spectrum
 from ep2sindy.studies.source import is_simulation, report_simulation, status_text
 from ep2sindy.studies.study import Deferred, Positive, PositiveOrAll
 from ep2sindy.thruster.axial.output import POWERS
 from ep2sindy.thruster.cache import write
-from ep2sindy.thruster.verdict import TRANSIT_HZ
 
 Simulated = Mapping[str, Any]  # attributes of a simulation: its status, and numbers in SI
 
 MIN_SAMPLES = 16  # fewer samples cannot be drawn
 AVERAGED = " Averaged over r by area."
 CAPTIONS = {
-    "current": "Discharge current over the record (above) and over the part that is shaded there, "
-    "next to the ion beam current (below).",
-    "spectrum": "Power spectrum of the discharge current; breathing lies below 60 kHz, "
-    "oscillations of ions in transit above.",
+    "current": "Discharge current over the record, and its power spectrum, the peak dashed: "
+    "breathing lies below 60 kHz, oscillations of ions in transit above.",
     "profiles": "Profiles along the axis: mean in time, the band that holds 5 to 95 % of the time, "
     "and the whole range. Dashed: the channel's exit.",
-    "maps": "Discharge current, neutrals and ions over time and axis: neutrals fill the channel, "
+    "maps": "Currents, neutrals and ions over time and axis: neutrals fill the channel, "
     "are ionised, and fill it again. Dashed: the channel's exit.",
 }
 BRIEF = ("I_d_mean", "I_d_std", "thrust_N", "isp_s", "mass_balance")
@@ -133,16 +130,11 @@ class Study:
         window = breathing.last_periods(time, f_kHz, self.figures.periods)
         highest = 0.5 / float(time[1] - time[0])
         up_to_Hz = min(self.figures.f_max_Hz or highest, highest)
-        spectrum = partial(
-            breathing.current_spectrum_figure,
-            field, f_kHz=f_kHz, f_max_Hz=up_to_Hz, transit_Hz=TRANSIT_HZ,
-        )  # fmt: skip
+        current = Trajectory(time, field["I_d"].values[:, None], ["I_d"], units={"I_d": "A"})
+        whole_s = float(time[-1] - time[0])
         report.section("Current")
-        draw = partial(breathing.current_figure, field, window)
+        draw = partial(data_figure, current, duration_s=whole_s, f_max_Hz=up_to_Hz)
         report.figure("current", draw, CAPTIONS["current"])
-        report.figure("spectrum", spectrum, CAPTIONS["spectrum"])
-        frequency, power = power_spectrum(time, field["I_d"].values)
-        report.samples("spectrum", pd.DataFrame({"frequency_Hz": frequency, "power": power}))
         report.section("Along the axis")
         radial = AVERAGED if "r" in field.dims else ""
         draw = partial(breathing.profile_figure, field)

@@ -1,38 +1,51 @@
 """A closed self-sustained model, found by free runs in one part of a record and tested on the rest.
 
 A self-sustained model is one that keeps oscillating on its own. The module also holds its section
-of a report.
+of a report, and the processes of its terms next to those that the record gives.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
+import pandas as pd
 
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.method import Regression
 from ep2sindy.discovery.result import Discovery
-from ep2sindy.figures import free_run as figures
+from ep2sindy.figures.series import balance_figure, cycle_figure, free_run_figure
 from ep2sindy.forecasting.evaluation import Evaluation
 from ep2sindy.forecasting.skill import ForecastSkill
 from ep2sindy.library.library import Library, polynomial
+from ep2sindy.library.relations import Constraint
 from ep2sindy.library.roles import Roles
 from ep2sindy.model.comparison import FreeRunBounds
 from ep2sindy.model.mass_action import consequences
 from ep2sindy.model.model import SparseModel
+from ep2sindy.model.stability import LimitCycle
 from ep2sindy.regression.searches import Search
 from ep2sindy.report.report import Report
-from ep2sindy.report.results import Metric, Metrics
+from ep2sindy.report.results import Metric, Metrics, ResultTable, View
 from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.selection.criteria import Selection
 from ep2sindy.signals.attractor import find_cycle, mean_cycle, white_variance
 from ep2sindy.signals.smoothers import KalmanSmoother
-from ep2sindy.signals.spectrum import power_spectrum, samples_in_periods
-from ep2sindy.studies.processes import NO_ZONES, TELLING, Zones, fit_roles
+from ep2sindy.signals.spectrum import power_spectrum
+from ep2sindy.studies.processes import (
+    IONS,
+    NEUTRALS,
+    NO_ZONES,
+    TELLING,
+    ComparedProcess,
+    Zones,
+    compared_processes,
+    fit_roles,
+)
 from ep2sindy.studies.study import Count, Positive
 from ep2sindy.studies.views import CYCLE, add_samples
 
@@ -41,11 +54,23 @@ CAPTIONS = {
     "time, over the data (grey): the first and the last periods.",
     "cycle": "Its cycle in the plane of two states, over the data (grey), and runs from other "
     "starts.",
+    "balance": "What zones gain or lose by each process, over two periods: in the record (grey), "
+    "and by the model's terms at the record's densities (colour).",
 }
 SPREAD = "spread over windows"  # of the coefficients: no knowledge of a rate
 SPREAD_NOTE = (
     "Spread over windows: 95 % intervals by how the windows of the refinement differ; they do not "
     "say how far off the model itself is."
+)
+
+
+BALANCE_NOTE = (
+    "Rates are means over the record; the model's are its terms at the record's densities. R2: of "
+    "the model's rate against the record's, sample by sample."
+)
+COUNTERPARTS = (
+    "Counterpart: the coefficients of the same terms by least squares of the recorded process on "
+    "them, with the R2 of that fit at each instant; ratio: the model's over the record's."
 )
 
 
@@ -174,7 +199,7 @@ def add_sustained(report: Report, name: str, found: SustainedModel) -> None:
     report.model(file, model, clock=clock, held=held_to, words=SPREAD, note=SPREAD_NOTE)
     if run.cycle is not None:
         period_s = run.cycle.period_s
-        draw = partial(figures.free_run_figure, run.record, run.rollout, period_s=period_s)
+        draw = partial(free_run_figure, run.record, run.rollout, period_s=period_s)
         report.figure(f"free_run_{name}", draw, CAPTIONS["free_run"])
     report.add(_notes(found))
     add_cycle(report, name, run)
@@ -184,7 +209,7 @@ def add_sustained(report: Report, name: str, found: SustainedModel) -> None:
 def add_cycle(report: Report, name: str, run: Evaluation) -> None:
     """Add the figure of the cycle of a model, if it has one. name: of the model."""
     if run.cycle is not None and len(run.model.states) > 1:
-        draw = partial(figures.cycle_figure, run.record, run.cycle)
+        draw = partial(cycle_figure, run.record, run.cycle)
         report.figure(f"cycle_{name}", draw, CAPTIONS["cycle"])
 
 
@@ -205,9 +230,69 @@ def start_of(run: Trajectory, model: SparseModel) -> np.ndarray:
     return smoothed[0]
 
 
-def two_periods(run: Trajectory) -> int | None:
-    """Samples in two periods; None if there is no period, or no room for two such windows."""
-    cycle = find_cycle(run.t, run.states)
-    if cycle is None or cycle.n_periods < 4.0:
-        return None
-    return samples_in_periods(2.0, frequency_Hz=cycle.frequency_Hz, dt_s=run.dt_s)
+PROCESSES: Metrics[ComparedProcess] = [
+    Metric("process", lambda each: each.name, View.SHOWN),
+    Metric(
+        "recorded",
+        lambda each: np.nan if each.recorded is None else float(each.recorded.mean()),
+        View.SHOWN, "in the record (m^-3/s)",
+    ),
+    Metric(
+        "modelled", lambda each: float(each.modelled.mean()), View.SHOWN, "in the model (m^-3/s)"
+    ),
+    Metric("ratio", lambda each: each.ratio, View.SHOWN, format="{:.2f}"),
+    Metric("r2", lambda each: each.r2, View.SHOWN, "R2", format="{:.3f}"),
+    Metric("terms", lambda each: ", ".join(each.coef), View.SHOWN),
+]  # fmt: skip
+
+
+def process_terms(processes: Sequence[ComparedProcess]) -> pd.DataFrame:
+    """One row per process and term: its coefficient in the model and by the record."""
+    rows = []
+    for each in processes:
+        for term, coef in each.coef.items():
+            recorded = each.counterpart.get(term, np.nan)
+            ratio = coef / (recorded or np.nan)
+            rows.append((each.name, term, coef, recorded, ratio, each.fit_r2))
+    columns = ["part", "term", "coefficient", "counterpart", "ratio", "fit_r2"]
+    return pd.DataFrame(rows, columns=columns)
+
+
+def model_balance(
+    model: SparseModel, held_to: Constraint | None, data: Trajectory, zones: Zones
+) -> list[ComparedProcess]:
+    """The processes of a model next to those of its zone.
+
+    held_to: what the model's coefficients obey; None if they are free. There are none unless the
+    model was found under roles of n_i and n_n, and the record gives a balance.
+    """
+    named = {state.partition("@")[0] for state in model.states}
+    if held_to is None or not held_to.processes or not zones.balances or named != {IONS, NEUTRALS}:
+        return []
+    return compared_processes(model, held_to, data, zones)
+
+
+def add_balance(
+    report: Report,
+    name: str,
+    processes: Sequence[ComparedProcess],
+    data: Trajectory,
+    cycle: LimitCycle | None,
+) -> None:
+    """Add the processes, and one row per term.
+
+    name: of the library. data: samples of the processes. cycle: of the model; without one there is
+    no figure.
+    """
+    report.section(f"{name}: terms as physical processes", level=3)
+    title = "what is exchanged, in record and model"
+    rows = ResultTable(processes, PROCESSES)
+    report.table(f"balance_{name}", rows, title=title, note=BALANCE_NOTE)
+    known = [each for each in processes if each.recorded is not None]
+    if known and cycle is not None:
+        shown = data.t - data.t[0] <= 2.0 * cycle.period_s
+        parts = {each.name: (each.recorded[shown], each.modelled[shown]) for each in known}  # type: ignore[index]
+        draw = partial(balance_figure, data.t[shown], parts, clock=data.clock)
+        report.figure(f"balance_{name}", draw, CAPTIONS["balance"])
+    terms, title = process_terms(processes), "each term by its process"
+    report.table(f"terms_{name}", terms, title=title, note=COUNTERPARTS)

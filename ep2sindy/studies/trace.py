@@ -30,7 +30,7 @@ from ep2sindy.discovery.one_signal import (
     run_on_rest,
     try_in_turn,
 )
-from ep2sindy.figures.free_run import free_run_figure
+from ep2sindy.figures.series import free_run_figure
 from ep2sindy.forecasting.baselines import AUTOREGRESSION
 from ep2sindy.forecasting.evaluation import Evaluation
 from ep2sindy.forecasting.skill import MODEL, ForecastSkill
@@ -41,8 +41,7 @@ from ep2sindy.report.results import Metric, Metrics, ResultTable, View, percent
 from ep2sindy.runtime.kept_pieces import Once
 from ep2sindy.signals.driving import add_drive, ask_whether_driven, report_unknown_drive
 from ep2sindy.signals.signal import Signal, prepare_signal
-from ep2sindy.studies.candidates import add_candidates, add_estimate
-from ep2sindy.studies.forecasts import add_forecasts
+from ep2sindy.studies.discoveries import add_candidates, add_estimate
 from ep2sindy.studies.resume import resumed
 from ep2sindy.studies.source import (
     Source,
@@ -54,7 +53,14 @@ from ep2sindy.studies.source import (
 )
 from ep2sindy.studies.study import A_LIST, Fraction, PositiveOrAll, Terms
 from ep2sindy.studies.sustained import CAPTIONS, add_cycle
-from ep2sindy.studies.views import CYCLE, EVALUATED, EVALUATION, add_samples, found_model
+from ep2sindy.studies.views import (
+    CYCLE,
+    EVALUATED,
+    EVALUATION,
+    add_forecasts,
+    add_samples,
+    found_model,
+)
 
 NAME = "trace"  # of the model, in files
 NOT_EXPLAINED = (

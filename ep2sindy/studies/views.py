@@ -1,9 +1,9 @@
-"""Views of runs that several studies share: figures, samples, and the model that was found."""
+"""Views that studies share: figures and samples of runs, forecasts, and what was found."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -14,14 +14,15 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.figures import series
 from ep2sindy.forecasting.baselines import AUTOREGRESSION
 from ep2sindy.forecasting.evaluation import Evaluation, size_text
-from ep2sindy.forecasting.skill import ForecastSkill
+from ep2sindy.forecasting.skill import MODEL, ForecastSkill, forecast_skill
 from ep2sindy.library.relations import Constraint
+from ep2sindy.model.model import SparseModel
 from ep2sindy.report.document import Block, Result, Table, Text
 from ep2sindy.report.models import equations
 from ep2sindy.report.report import Report
 from ep2sindy.report.results import Metric, Metrics, View
-from ep2sindy.signals.smoothers import Smoother
-from ep2sindy.signals.spectrum import dominant_frequency
+from ep2sindy.runtime.progress import SILENT, Progress
+from ep2sindy.studies.source import LEAST_SAMPLES, is_short
 from ep2sindy.studies.study import PositiveOrAll
 
 if TYPE_CHECKING:
@@ -32,9 +33,13 @@ CAPTIONS = {
     "trajectories": "Models integrated from the first sample (colour) over the data (grey).",
     "trajectories_started": "The same from a start fitted to the first one and a half periods.",
     "trajectories_thesis": "The same with the thesis's terms, fitted to these data.",
-    "derivatives": "Right-hand sides on the data (colour) over the data's derivative (grey).",
     "phase": "Phase portraits of the integrated models (colour) over the data (grey), dots where "
     "they start.",
+    "forecast": "Forecast of the last part of the record, its start estimated from the past "
+    "alone, with the band that is to hold 90 % of the samples. Last panel: error of forecasts from "
+    "starts all over that part, by horizon (1: no better than the mean); persistence: the last "
+    "sample stays; harmonics: the mean cycle continues; autoregression: linear in the samples or "
+    "in their logarithms, its order by AIC; neighbours: what followed the most similar moments.",
 }
 
 
@@ -66,13 +71,11 @@ def add_figures(
     runs: Mapping[str, Evaluation],
     shown: PlotRange,
     *,
-    smoother: Smoother | None = None,
     since: str = series.SINCE_START,
     suffix: str = "",
 ) -> None:
     """Add the named figures of CAPTIONS; phase portraits need two states or more.
 
-    smoother: gives the data's derivative; without one there are no derivative figures.
     since: the origin of the time axis of runs, in words. suffix: to the names, for runs of another
     kind, which CAPTIONS describes by such a name.
     """
@@ -85,11 +88,6 @@ def add_figures(
             series.trajectory_figure, data, rollouts, duration_s=span, since=since, **how
         ),
     }
-    if smoother is not None:
-        models = {name: run.model for name, run in runs.items()}
-        drawn["derivatives"] = partial(
-            series.derivative_figure, data, models, smoother=smoother, duration_s=span
-        )
     if len(data.state_names) > 1:
         drawn["phase"] = partial(series.phase_figure, data, rollouts, duration_s=span, **how)
     for name in names:
@@ -171,7 +169,6 @@ COMPARED = View.FILES | View.HEADLINE
 EVALUATION: Metrics[Evaluation] = [
     Metric("from_s", lambda run: float(run.record.t[0])),
     Metric("to_s", lambda run: float(run.record.t[-1])),
-    Metric("record_frequency_Hz", lambda run: _record_frequency_Hz(run)),
     Metric("frequency", lambda run: run.frequency_text, View.SCREEN),
     Metric("frequency_Hz", lambda run: run.frequency_Hz),
     Metric("f_kHz", lambda run: 1e-3 * run.frequency_Hz[run.model.states[0]], View.HEADLINE),
@@ -200,7 +197,55 @@ def largest(values: Mapping[str, float]) -> float:
     return float(np.max(list(values.values())))
 
 
-def _record_frequency_Hz(run: Evaluation) -> dict[str, float]:
-    columns = run.record.columns(run.model.states).T
-    found = [dominant_frequency(run.record.t, column) for column in columns]
-    return dict(zip(run.model.states, found, strict=True))
+def why_none(run: Trajectory, n_fitted: int) -> str:
+    """Why a record is too short for forecasts; empty if it is not."""
+    if not is_short(run, n_fitted):
+        return ""
+    return (
+        f"no forecasts: they need {LEAST_SAMPLES} samples or more to fit and as many to test; the "
+        f"record has {run.n_samples}, {n_fitted} to fit and {run.n_samples - n_fitted} to test"
+    )
+
+
+def skill_of(
+    model: SparseModel, run: Trajectory, *, n_fitted: int, starts: int, seen: bool,
+    progress: Progress = SILENT,
+) -> ForecastSkill | None:  # fmt: skip
+    """Skill of a model of measured states; None for an empty model, or a short record.
+
+    seen: whether the model was fitted to all of the record.
+    """
+    if not starts or is_short(run, n_fitted) or not model.coef.any():
+        return None
+    skill = forecast_skill(model, run, n_fitted=n_fitted, starts=starts, progress=progress)
+    return replace(skill, seen=seen)
+
+
+def add_forecasts(
+    report: Report, name: str, run: Trajectory, skill: ForecastSkill, *, title: str = "Forecasts"
+) -> None:
+    """Add how far ahead a model forecasts, next to baselines: a part of the section before.
+
+    name: of the model, which names the files.
+    """
+    report.section(title, f"forecasts: {skill.text}", _note(skill), level=3)
+    report.figure(
+        f"forecast_{name}", partial(series.forecast_figure, run, skill), CAPTIONS["forecast"]
+    )
+    errors = pd.DataFrame({"horizon_s": skill.horizons_s, **skill.nrmse})
+    report.samples(f"forecast_{name}", errors)
+    report.summary.setdefault("forecasts", {})[name] = skill.summary()
+
+
+def _note(skill: ForecastSkill) -> str:
+    """How many forecasts there are, and how far their bands can be trusted."""
+    held = f"the bands of 90 % hold {100.0 * skill.coverage_90:.0f} % of the samples"
+    if not np.isfinite(skill.coverage_90):
+        held = (
+            "there are no bands: what the model was fitted to is too short, grows or decays "
+            "throughout, or forecasts of it diverge"
+        )
+    steps = " Baselines take the samples interpolated onto equal steps." if skill.resampled else ""
+    fitted = ", although the model was fitted to all of the record" if skill.seen else ""
+    n = len(skill.squared[MODEL])
+    return f"{n} starts, whose states are estimated from the past alone{fitted}; {held}.{steps}"
