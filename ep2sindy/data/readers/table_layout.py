@@ -10,7 +10,7 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import zip_longest
+from itertools import pairwise, zip_longest
 
 from ep2sindy.library.units import is_count, unit_like
 from ep2sindy.trust.memory import check_width
@@ -243,7 +243,7 @@ def header_of(above: Table, n_columns: int, *, strict: bool, is_comment: bool) -
     numbered = Header(tuple(map(str, range(n_columns))), ("",) * n_columns, step_s)
     if not above:
         return numbered
-    if len(above) > 1 and (counted := _rigol_header(above, n_columns)) is not None:
+    if (counted := _rigol_header(above, n_columns)) is not None:
         return counted
     has_units = len(above) > 1 and _are_units(above[-1], above[-2])
     names, units = (above[-2], above[-1]) if has_units else (above[-1], [])
@@ -377,13 +377,10 @@ def _rigol_header(above: Table, n_columns: int) -> Header | None:
     Its first column numbers the samples. The last cells of its two header lines give the start and
     the increment of time.
     """
-    for k, cells in enumerate(above):
-        words = [cell.lower() for cell in cells]
-        below = dict(zip(words, above[k + 1] if k + 1 < len(above) else [], strict=False))
-        step = below.get("increment", "")
-        if len(words) > n_columns and re.fullmatch(PLAIN["."], step):
-            units = _known_units(above[k + 1], n_columns)
-            return Header(_unique(cells[:n_columns]), units, float(step))
+    for cells, below in pairwise(above):
+        step = dict(zip(map(str.lower, cells), below, strict=False)).get("increment", "")
+        if len(cells) > n_columns and re.fullmatch(PLAIN["."], step):
+            return Header(_unique(cells[:n_columns]), _known_units(below, n_columns), float(step))
     return None
 
 
