@@ -11,6 +11,7 @@ from scipy.io import savemat
 
 import ep2sindy as ep
 from ep2sindy.data.fields import clock_of
+from ep2sindy.data.inspection import compare_files
 from ep2sindy.data.quantities import axis_of, axis_unit, conversion, quantity_of
 from ep2sindy.data.readers.registry import open_source
 from ep2sindy.data.recognition import recognise
@@ -324,3 +325,26 @@ def test_what_counts_samples_is_no_time(tmp_path: Path, first: int) -> None:
 def test_one_bad_column_does_not_take_the_rest(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("t_s,x,y\n0,1,2\n1,0,1\n2,2,oops\n3,5,1\n")
     assert list(ep.open_field(tmp_path / "a.csv").data_vars) == ["x"]
+
+
+def test_what_differs_between_files_of_a_kind_is_listed(tmp_path: Path) -> None:
+    x = WAVE[:, 0, 0]
+    first = ep.inspect_file(write_csv(tmp_path / "a.csv", t_s=T, x=x, y=x))
+    alike = ep.inspect_file(write_csv(tmp_path / "b.csv", t_s=T[:30], x=2.0 * x[:30], y=x[:30]))
+    other = ep.inspect_file(write_csv(tmp_path / "c.csv", t_s=2.0 * T, x=x))
+    differing, same = compare_files(first, [alike, other])
+    assert differing.startswith(f"{other.source.path}: read as: text, 2 columns")
+    assert "3e-06 apart" in differing
+    assert differing.endswith("y: absent")
+    assert "x: " not in differing
+    assert same == f"{alike.source.path}: the same arrays; 30 samples"
+
+
+def test_a_channel_that_a_file_states_is_not_asked_for(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.attrs["channel_m"] = 0.025
+        for name, values, unit in (("time", T, "s"), ("z", Z, "m"), ("n_i", N_I[..., 0], "m^-3")):
+            file[name] = values
+            file[name].attrs["units"] = unit
+    assert not any("channel" in note for note in ep.inspect_file(tmp_path / "a.h5").notes())
+    assert ep.open_field(tmp_path / "a.h5").attrs["channel_m"] == 0.025

@@ -160,12 +160,9 @@ def compare_runs(runs: Sequence[ReadRun], figures: Sequence[str], *, beside: Pat
     rows = [
         {
             "run": run.label,
-            "experiment": run.about["experiment"],
             "folder": Link(str(run.folder), os.path.relpath(run.folder / "report.html", beside)),
-            "seed": run.about["seed"],
             "code": str(run.provenance["commit"])[:12],
-            "warnings": run.about["warnings"],
-            "found": run.about["found"],
+            **run.about,
         }
         for run in runs
     ]

@@ -14,7 +14,7 @@ import numpy as np
 from omegaconf import OmegaConf
 
 from ep2sindy.app.config_files import conf_folder
-from ep2sindy.data.fields import SPACE
+from ep2sindy.data.fields import SPACE, channel_length_m
 from ep2sindy.data.inspection import STEP, Inspection, compare_files, unlike
 from ep2sindy.data.mapping import Variable, read_array
 from ep2sindy.data.open import inspect_file
@@ -32,18 +32,11 @@ and what is missing for which experiment. Several files, or a pattern in quotes,
 records of one kind; if their names differ in numbers, they may be operating points."""
 
 # Variables that experiments on files need besides time; generic experiments need none.
+DENSITIES, FLOWS = ("n_i", "n_n"), ("n_i", "n_n", "R_ion", "u_iz")
 NEEDS: Mapping[str, tuple[str, ...]] = {
-    "breathing": ("n_i", "n_n"),  # of three libraries one; the others are left out
-    "weak": ("n_i", "n_n"),
-    "constrained": ("n_i", "n_n", "R_ion", "u_iz"),
-    "ils": ("n_i", "n_n"),
-    "theories": ("n_i", "n_n", "R_ion", "u_iz"),  # the last two for the balance of a file
-    "parametric": ("n_i", "n_n", "R_ion", "u_iz"),
-    "predict": (),
-    "zones": ("n_i", "n_n"),
-    "pointwise": ("n_i", "n_n", "R_ion", "u_iz"),
-    "trace": (),
-    "discover": (),
+    **dict.fromkeys(("breathing", "weak", "ils", "zones"), DENSITIES),
+    **dict.fromkeys(("constrained", "theories", "parametric", "pointwise"), FLOWS),
+    **dict.fromkeys(("predict", "trace", "discover"), ()),
 }
 
 NOT_STATES = ("R_ion", "V_d")  # what drives a model
@@ -160,11 +153,9 @@ def point_commands(
     found: Inspection, data: Sequence[str], inputs: Sequence[str]
 ) -> list[list[str]]:
     """Commands that study the files as operating points: two densities, or else one signal."""
-    given, lines = [*channel(found), *preparation(found)], []
-    if not found.lacking(NEEDS["breathing"]):
-        lines.append(["+exp=breathing", *data, *given])
+    lines = breathing_commands(found, data)
     if not found.lacking(NEEDS["parametric"]):
-        lines.append(["+exp=parametric", *data, "thesis=null", *given])
+        lines.append(["+exp=parametric", *data, "thesis=null", *field_settings(found)])
     signals = signals_of(found, [*NOT_STATES, *inputs])
     states = signals[:1] if "I_d" in signals else signals or list(found.signals)
     if lines or not states:
@@ -232,9 +223,7 @@ def record_commands(
 ) -> list[list[str]]:
     """Commands that study one record, or several of one system. inputs: proposed ones."""
     given = [f"inputs=[{','.join(inputs)}]"] * bool(inputs)
-    lines = []
-    if not found.lacking(NEEDS["breathing"]):
-        lines.append(["+exp=breathing", *data, *channel(found), *preparation(found)])
+    lines = breathing_commands(found, data)
     signals = signals_of(found, inputs)
     if signals and not are_several:
         lines.append(["+exp=trace", *data, f"signal={signals[0]}", *given])
@@ -248,15 +237,17 @@ def record_commands(
     return lines
 
 
-def channel(found: Inspection) -> list[str]:
-    """The setting of the channel's length, if a zone of it needs one that the file lacks."""
-    return [] if found.z is None or found.source.channel_m else ["data.channel_m=LENGTH"]
+def breathing_commands(found: Inspection, data: Sequence[str]) -> list[list[str]]:
+    """The command that studies two densities; none if the file lacks one."""
+    line = ["+exp=breathing", *data, *field_settings(found)]
+    return [] if found.lacking(NEEDS["breathing"]) else [line]
 
 
-def preparation(found: Inspection) -> list[str]:
-    """The setting that makes what a file lacks, if there is any."""
+def field_settings(found: Inspection) -> list[str]:
+    """Settings of the channel's length and of steps that make variables, as the file lacks them."""
+    is_known = found.z is None or channel_length_m(found.source.attributes)
     steps = ",".join(f"{{_target_:{step}}}" for step in found.prepare.values())
-    return [f"prepare=[{steps}]"] if steps else []
+    return [*["data.channel_m=LENGTH"] * (not is_known), *[f"prepare=[{steps}]"] * bool(steps)]
 
 
 def _word_for(path: Path) -> str:

@@ -14,6 +14,7 @@ import os
 import sys
 from collections.abc import Sequence
 from importlib import import_module
+from itertools import pairwise
 from pathlib import Path
 from shlex import quote
 from typing import Any
@@ -92,9 +93,7 @@ def run(conf: Path) -> list[str]:
         jobs[-1] += run_job(config, conf)
 
     def composed(settings: list[str]) -> DictConfig:
-        folders = (
-            options[options.index("--config-dir") + 1 :][:1] if "--config-dir" in options else []
-        )
+        folders = [value for name, value in pairwise(options) if name == "--config-dir"]
         places = [f"file://{Path(folder).absolute()}" for folder in folders]
         with initialize_config_dir(str(conf), version_base="1.3"):
             return compose("config", [f"hydra.searchpath={places}", *settings])

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from hashlib import sha256
 from pathlib import Path
@@ -50,7 +50,7 @@ def precompile() -> None:
         return
     say_once(ANNOUNCEMENT)
     with suppress(OSError):  # on a full disk, the next run repeats this half minute
-        collect(Loky(), _compile, [*PARTS], Bars().stage(len(PARTS), "part"))
+        collect(Loky(), _compile, PARTS, Bars().stage(len(PARTS), "part"))
         stamp.mkdir()
 
 
@@ -66,8 +66,8 @@ def _stamp() -> Path:
     return cache_folder("kernels", f"warm_{sha256(versions.encode()).hexdigest()[:16]}")
 
 
-def _compile(part: str) -> None:
-    PARTS[part]()
+def _compile(part: Callable[[], None]) -> None:
+    part()
     for error in UNKEPT[:1]:
         raise error
 
@@ -113,8 +113,4 @@ def _plane() -> None:
     )
 
 
-PARTS: Mapping[str, Callable[[], None]] = {
-    "search": _search,
-    "refinement": _refinement,
-    "plane": _plane,
-}
+PARTS = (_search, _refinement, _plane)

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from shlex import quote
 
+from ep2sindy.data.fields import channel_length_m
 from ep2sindy.data.mapping import TEXT, ArrayInfo, Variable
 from ep2sindy.data.quantities import KNOWN_UNITS, MADE_FROM, is_counter_name
 from ep2sindy.data.readers.source import FileSource
@@ -132,7 +133,7 @@ class Inspection:
         texts += [
             f"{n} is made by {step} from {MADE_FROM[n][0]}" for n, step in self.prepare.items()
         ]
-        if "z" in self.axes and self.source.channel_m is None:
+        if "z" in self.axes and channel_length_m(self.source.attributes) is None:
             texts.append(
                 "no length of the channel: give it, data.channel_m=LENGTH in m, or a zone, "
                 "'trajectory.zone.z=[FROM,TO]' in m, for experiments that average over one"
@@ -154,33 +155,26 @@ class Inspection:
 
     def differences(self, first: Inspection) -> list[str]:
         """In what this file differs from another of its kind: all but ranges and samples."""
-        own, other = self._words_of_arrays(), first._words_of_arrays()
-        lacks, more = [n for n in other if n not in own], [n for n in own if n not in other]
-        changed = {n: [w for w in own[n] if w not in other[n]] for n in own if n in other}
-        texts = [
-            self.source.kind * (self.source.kind != first.source.kind),
-            self.source.words * (self.source.words != first.source.words),
-            f"without {', '.join(lacks)}" * bool(lacks),
-            f"also {', '.join(more)}" * bool(more),
-            *(f"{name}: {', '.join(words)}" * bool(words) for name, words in changed.items()),
+        own, other = self._kept_alike(), first._kept_alike()
+        differing = [name for name in {**other, **own} if own.get(name) != other.get(name)]
+        return [
+            *(f"{name}: {', '.join(own.get(name, ['absent']))}" for name in differing),
             *(text for text in self.questions if text not in first.questions),
         ]
-        return [text for text in texts if text]
 
-    def _words_of_arrays(self) -> dict[str, list[str]]:
-        """The description of each array, but for its range."""
-        n = self.n_samples
-        return {
-            one.name: [
+    def _kept_alike(self) -> dict[str, list[str]]:
+        """What files of a kind have in common: how they are read, and each array but its range."""
+        found = {"read as": [self.source.kind, self.source.words]}
+        for one in self.held:
+            found[one.name] = [
                 one.problem or "numbers",
-                f"shape {['time' if size == n else size for size in one.shape]}",
+                f"shape {['time' if n == self.n_samples else n for n in one.shape]}",
                 one.unit or "no unit",
                 f"taken as {', '.join(self._roles.get(one.name, ['-']))}",
                 f"{one.n_missing} missing",
-                f"{one.step:.3g} apart" if one.step else "",
+                *([f"{one.step:.3g} apart"] if one.step else []),
             ]
-            for one in self.held
-        }
+        return found
 
     def __repr__(self) -> str:
         return one_screen(self.lines(), n_lines=60)

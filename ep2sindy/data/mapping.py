@@ -130,8 +130,6 @@ def read_array(source: FileSource, ours: str, name: str) -> xr.DataArray:
             f"{name!r} (wanted as {ours}) must lie inside its array: {whole!r} has shape "
             f"{array.shape}, counted from 0"
         ) from error
-    if (unit := source.units.get(whole)) and not array.attrs.get("units"):
-        array = array.assign_attrs(units=unit)
     array = array if array.dtype in (np.float32, np.float64) else array.astype(np.float64)
     if not source.is_table:
         return array
@@ -162,9 +160,8 @@ def list_arrays(source: FileSource) -> str:
         except Exception:  # raised by a library for a damaged array; list its name all the same
             texts.append(name)
             continue
-        unit = array.attrs.get("units") or source.units.get(name, "")
         shape = f"({', '.join(map(str, array.shape))})"
-        texts.append(f"{name} {shape} {unit}".rstrip())
+        texts.append(f"{name} {shape} {array.attrs.get('units', '')}".rstrip())
     n_more = len(source.names) - len(texts)
     texts += [f"and {n_more} more"] if n_more else []
     return ", ".join(texts) or "nothing"
@@ -225,7 +222,7 @@ def describe_array(source: FileSource, name: str) -> ArrayInfo:
     except ValueError as error:  # its reason, without the file's name
         reason = str(error).removeprefix(f"{source.path} cannot be read: ")
         return ArrayInfo(name, problem=TEXT if "real numbers" in reason else reason)
-    attribute = str(array.attrs.get("units", "") or source.units.get(name, ""))
+    attribute = str(array.attrs.get("units", ""))
     unit = counted_in(attribute) if attribute else unit_in_brackets(name)
     dims = tuple(map(str, array.dims)) if source.dims_named else ()
     is_vector = array.size in array.shape

@@ -219,16 +219,14 @@ def quantiles(draws: Float[np.ndarray, "draws ..."], levels: Sequence[float]) ->
     # Sorted along the last axis, which is many times as fast as np.nanquantile.
     ordered = np.sort(np.moveaxis(np.where(np.isfinite(draws), draws, np.nan), 0, -1), axis=-1)
     n = np.isfinite(ordered).sum(axis=-1)
-    found = np.empty((len(levels), *n.shape))
-    for k, level in enumerate(levels):
-        place = np.clip(level * (n + 1) - 1, 0, np.maximum(n - 1, 0))
-        below = place.astype(np.int64)
-        above = np.minimum(below + 1, np.maximum(n - 1, 0))
-        low, high = (
-            np.take_along_axis(ordered, at[..., None], axis=-1)[..., 0] for at in (below, above)
-        )
-        found[k] = low + (place - below) * (high - low)
-    return found
+    last = np.maximum(n - 1, 0)
+    place = np.clip(np.multiply.outer(levels, n + 1) - 1, 0, last)
+    below = place.astype(np.int64)
+    low, high = (
+        np.take_along_axis(ordered[None], at[..., None], axis=-1)[..., 0]
+        for at in (below, np.minimum(below + 1, last))
+    )
+    return low + (place - below) * (high - low)
 
 
 def band_of(draws: Float[np.ndarray, "draws ..."], level: float) -> np.ndarray:

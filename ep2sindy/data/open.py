@@ -120,7 +120,7 @@ def open_field(
     if doubt := _step_doubt(source, times, field, dt_s):
         warnings.warn(doubt, DoubtfulUnit, stacklevel=2)
     attrs = {
-        "channel_m": channel_m or source.channel_m,
+        "channel_m": channel_m,
         "file": str(source.path),
         STEP_DOUBT: doubt,
     }

@@ -368,8 +368,13 @@ def low_pass(field: xr.Dataset, *, cutoff_Hz: float, order: int = 4) -> xr.Datas
         If time steps are unequal (beyond 1e-3 of a step), the cutoff does not lie between 0 and
         half the sampling rate, or the record is shorter than the edges of the filter.
     """
-    dt_s = _uniform_step(field)
-    n_edge = 3 * (order + 1)
+    steps = np.diff(grid_points(field, "time"))
+    dt_s, n_edge = float(steps.mean()), 3 * (order + 1)
+    if np.ptp(steps) > 1e-3 * dt_s:
+        raise ValueError(
+            f"a low-pass needs equal time steps: they run from {steps.min():g} to {steps.max():g} "
+            "s; bring the field to equal steps first (ep2sindy.data.resample)"
+        )
     if not 0 < cutoff_Hz < 0.5 / dt_s:
         raise ValueError(
             f"cutoff_Hz must lie between 0 and half the sampling rate, {0.5 / dt_s:g} Hz, got "
@@ -383,19 +388,6 @@ def low_pass(field: xr.Dataset, *, cutoff_Hz: float, order: int = 4) -> xr.Datas
     sos = signal.butter(order, cutoff_Hz, fs=1 / dt_s, output="sos")
     smooth = partial(signal.sosfiltfilt, sos, axis=0, padlen=n_edge)
     return _with_samples(field, _of_time(field), smooth)
-
-
-def _uniform_step(field: xr.Dataset) -> float:
-    """Time step in s; raises ValueError if the steps are unequal."""
-    steps = np.diff(grid_points(field, "time"))
-    dt_s = float(steps.mean())
-    if np.ptp(steps) > 1e-3 * dt_s:
-        k = int(np.argmax(np.abs(steps - dt_s)))
-        raise ValueError(
-            f"a low-pass needs equal time steps: t[{k + 1}] - t[{k}] = {steps[k]:g} s, the mean "
-            f"is {dt_s:g} s; bring the field to equal steps first (ep2sindy.data.resample)"
-        )
-    return dt_s
 
 
 def resample(field: xr.Dataset, *, dt_s: float) -> xr.Dataset:

@@ -202,8 +202,7 @@ def own_unit(ours: str, file_unit: str) -> str:
     """
     if file_unit and is_count(file_unit):
         return file_unit
-    suffixes = [unit for suffix, unit in SUFFIX_UNITS.items() if ours.endswith(f"_{suffix}")]
-    options = (file_unit, *suffixes)
+    options = (file_unit, _promised_unit(ours))
     return next((u for u in options if u and converts(ours, u, is_variable=True)), "1")
 
 
@@ -212,21 +211,26 @@ def columns_in_si(table: pd.DataFrame) -> tuple[Columns, dict[str, str]]:
     values = np.empty(table.shape)
     units: dict[str, str] = {}
     for k, label in enumerate(table.columns):
-        name, in_label = (label, "") if label.isidentifier() else split_name(label)
+        name, in_label = split_label(label)
         name, unit = quantity_of(name, in_label) or (name, own_unit(name, in_label))
-        units[name] = unit or "1"
-        values[:, k] = without_marks(table[label].to_numpy(dtype=np.float64))
-        if units[name] != "1" and not is_count(units[name]):
-            factor, zero, units[name] = conversion(name, units[name], is_variable=True)
-            values[:, k] = factor * values[:, k] + zero
+        factor, zero = 1.0, 0.0
+        if not is_count(unit):
+            factor, zero, unit = conversion(name, unit or "1", is_variable=True)
+        values[:, k] = factor * without_marks(table[label].to_numpy(dtype=np.float64)) + zero
+        units[name] = unit
     return values, units
+
+
+def split_label(label: str) -> tuple[str, str]:
+    """Name and unit of a table's column; a label of one word holds the unit in its name."""
+    return (label, "") if label.isidentifier() else split_name(label)
 
 
 def time_unit(name: object) -> str | None:
     """Unit of a column of times that is called so, seconds by default; None for another column."""
     if not isinstance(name, str) or axis_of(name) != "time":
         return None
-    return axis_unit("time", name, "" if name.isidentifier() else split_name(name)[1]) or "s"
+    return axis_unit("time", name, split_label(name)[1]) or "s"
 
 
 # Conversion from the unit used in a file to the unit that our name for the quantity implies.
@@ -278,9 +282,8 @@ def conversion(ours: str, unit: str, *, is_variable: bool = False) -> tuple[floa
     """
     if is_variable and unit == "1":
         return 1.0, 0.0, unit
-    suffixes = (u for suffix, u in SUFFIX_UNITS.items() if ours.endswith(f"_{suffix}"))
     known = KNOWN_UNITS if is_variable else COORDINATE_UNITS | KNOWN_UNITS
-    target = known.get(ours) or next(suffixes, None)
+    target = known.get(ours) or _promised_unit(ours) or None
     if unit == (target or "1") and unit in PLAIN | {"1"}:
         return 1.0, 0.0, unit
     try:
@@ -307,6 +310,11 @@ def conversion(ours: str, unit: str, *, is_variable: bool = False) -> tuple[floa
         named = (u for u in NAMED_UNITS if registry().Quantity(1, u).check(ruler.dimensionality))
         target = next(named, plain)
     return factor, zero, unit_product([(target, 1)])
+
+
+def _promised_unit(ours: str) -> str:
+    """Unit that the suffix of a name promises; "" for a name without one."""
+    return next((u for suffix, u in SUFFIX_UNITS.items() if ours.endswith(f"_{suffix}")), "")
 
 
 def converts(ours: str, unit: str, *, is_variable: bool = False) -> bool:

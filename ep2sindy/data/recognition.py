@@ -336,8 +336,6 @@ class _Arrays:
         """
         if not one.lengths or one.low != one.low:
             return False
-        if lengths == {"time": one.shape[0]} and len(one.shape) == 1:
-            return True
         if one.dims and set(one.dims) <= known:
             return True
         ways = fitting(one.shape, lengths)

@@ -12,7 +12,7 @@ import numpy as np
 
 from ep2sindy.data.gaps import MissingSamples, describe_gaps, describe_missing, present_rows
 from ep2sindy.data.numbers import count_dates, real_numbers, seconds
-from ep2sindy.data.quantities import axis_of, columns_in_si, time_unit
+from ep2sindy.data.quantities import columns_in_si, time_unit
 from ep2sindy.data.trajectory import CLOCK, PARAMETER, ROLE, Trajectory
 from ep2sindy.library.units import SECONDS, Clock, seconds_in
 from ep2sindy.runtime.values import Columns, Samples, check_list, check_positive
@@ -207,39 +207,33 @@ def _from_table(table: pd.DataFrame, partial: bool) -> Trajectory:
             f"columns of a table must have names of their own, got {list(table.columns)}; rename "
             "or drop those that repeat"
         )
-    times = [name for name in table.columns if name in TIMES]
-    times = times or [name for name in table.columns if axis_of(name) == "time"]
+    times = {name: unit for name in table.columns if (unit := time_unit(name))}
+    times = {name: unit for name, unit in times.items() if name in TIMES} or times
     if len(times) != 1:
         raise ValueError(
             f"a table must have one time column, called one of {list(TIMES)}, in s, or by its unit "
             f"of time, as 'Year' or 'Time (h)': its columns are {list(table.columns)}; rename one "
             "with table.rename(columns=...)"
         )
-    states = [name for name in table.columns if name != times[0]]
-    kinds = {name: table[name].dtype for name in (times[0], *states)}
-    wrong = {name: str(kind) for name, kind in kinds.items() if kind.kind not in "iuf"}
-    if kinds[times[0]].kind in "mM":
-        del wrong[times[0]]
+    ((time, unit),) = times.items()
+    wrong = {
+        str(name): str(kind)
+        for name, kind in table.dtypes.items()
+        if kind.kind not in ("iufmM" if name == time else "iuf")
+    }
     if wrong:
-        hint = "give time in s, as numbers or dates" if times[0] in wrong else "drop them"
+        hint = "give time in s, as numbers or dates" if time in wrong else "drop them"
         raise ValueError(f"columns of a table must hold real numbers, got {wrong}; {hint}")
-    values, units = columns_in_si(table[states])
-    states = list(units)
-    t, clock = _elapsed(table[times[0]])
-    return _present(t, values, states, partial, units=units, clock=clock)
+    values, units = columns_in_si(table.drop(columns=time))
+    t, clock = _elapsed(table[time], unit)
+    return _present(t, values, units, clock, partial)
 
 
 def _present(
-    t: Samples,
-    values: Columns,
-    states: Sequence[str],
-    partial: bool,
-    *,
-    clock: Clock,
-    units: Mapping[str, str],
+    t: Samples, values: Columns, units: Mapping[str, str], clock: Clock, partial: bool
 ) -> Trajectory:
-    """The run without the samples that are NaN; partial: as in `trajectories_of`."""
-    absent = np.isnan(values)
+    """The run without the samples that are NaN. units: by state. partial: see `trajectories_of`."""
+    states, absent = list(units), np.isnan(values)
     if not absent.any():
         return Trajectory(t, values, states, clock=clock, units=units)
     missing = None
@@ -254,12 +248,11 @@ def _present(
     return Trajectory(t[kept], values[kept], states, missing=missing, clock=clock, units=units)
 
 
-def _elapsed(column: pd.Series) -> tuple[Samples, Clock]:
+def _elapsed(column: pd.Series, unit: str) -> tuple[Samples, Clock]:
     """Times of a column in s, and their clock: the unit in its name; of dates, by their steps."""
     if column.dtype.kind in "mM":
         t, unit = count_dates(column)
         return t, Clock.of(unit)
-    unit = "s" if column.name in TIMES else time_unit(column.name) or "s"
     t = seconds(column.to_numpy())
     return (t, SECONDS) if unit == "s" else (t * seconds_in(unit), Clock.of(unit))
 
@@ -274,4 +267,4 @@ def _from_arrays(t: object, x: object, partial: bool) -> Trajectory:
         )
     columns = real_numbers(states[:, None] if states.ndim == 1 else states, "states")
     names = ["x"] if states.ndim == 1 else [f"x{k}" for k in range(states.shape[1])]
-    return _present(seconds(times), columns, names, partial, clock=SECONDS, units={})
+    return _present(seconds(times), columns, dict.fromkeys(names, "1"), SECONDS, partial)

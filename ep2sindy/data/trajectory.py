@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ep2sindy.data.gaps import LONGEST_STEP, MIN_SEGMENT, between_gaps, mean_step, usual_step
+from ep2sindy.data.gaps import LONGEST_STEP, MIN_SEGMENT, between_gaps, mean_step, present_rows
 from ep2sindy.data.numbers import check_magnitude, real_numbers, rounding_s, seconds
 from ep2sindy.library.names import check_state, check_variable
 from ep2sindy.library.units import SECONDS, Clock
@@ -161,20 +161,14 @@ class Trajectory:
         """
         if self.missing is None:
             return self
-        kept: Mask = np.logical_not(self.missing.any(axis=1))
-        if kept.sum() < 2:
-            raise ValueError(
-                f"two samples or more must hold all states: {self._lacking()}, and {kept.sum()} "
-                f"of {self.n_samples} hold all; TrajectorySearch() takes states of their own rates"
-            )
-        return self._at(kept)
+        return self._at(present_rows(dict(zip(self.names, self._as_measured().T, strict=True))))
 
     def _lacking(self) -> str:
-        """How many samples every state lacks."""
+        """How many samples every state lacks, in brackets; "" if it lacks none."""
         if self.missing is None:
-            return "no sample is missing"
+            return ""
         counts = zip(self.state_names, self.missing.sum(axis=0).tolist(), strict=True)
-        return ", ".join(f"{name} lacks {n}" for name, n in counts if n)
+        return f" ({', '.join(f'{name} lacks {n}' for name, n in counts if n)})"
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -247,8 +241,8 @@ class Trajectory:
         if not found:
             raise ValueError(
                 f"a trajectory must hold {min_samples} samples without a gap: {len(pieces) - 1} "
-                f"steps are over {LONGEST_STEP:g} times the median step of "
-                f"{usual_step(self.t):.4g} s; cut it at its pauses, or interpolate it first"
+                f"steps are over {LONGEST_STEP:g} times the median step; cut it at its pauses, or "
+                "interpolate it first"
             )
         return found
 
@@ -294,10 +288,10 @@ class Trajectory:
         step = " to ".join(f"{factor * each:.4g}" for each in lengths)
         label = f" {self.label!r}" if self.label else ""
         label += f" at {point_label(self.parameters)}" if self.parameters else ""
-        lacking = "" if self.missing is None else f" ({self._lacking()})"
+        span = f"{factor * self.t[0]:.6g} to {factor * self.t[-1]:.6g}"
         return (
-            f"Trajectory{label}: {self.n_samples} samples{lacking}, t = {factor * self.t[0]:.6g} "
-            f"to {factor * self.t[-1]:.6g} {unit} in steps of {step} {unit}"
+            f"Trajectory{label}: {self.n_samples} samples{self._lacking()}, t = {span} {unit} in "
+            f"steps of {step} {unit}"
         )
 
     def _ranges(self) -> list[list[str]]:

@@ -277,22 +277,11 @@ def resolve_zone(zone: Zone | None, field: xr.Dataset) -> Zone:
         points = grid_points(field, "z")
         raise ValueError(
             f"an average over {_part_text(zone.z)} needs the channel's length, which the file does "
-            f"not say: give data.channel_m=LENGTH in m{_at_peak(field)}, or a zone of your own, "
+            f"not say: give data.channel_m=LENGTH in m, or a zone of your own, "
             f"'trajectory.zone.z=[FROM,TO]' in m (null: all of it); its z runs from "
             f"{points[0]:.4g} to {points[-1]:.4g} m"
         )
     return replace(zone, z=((1.0 - PARTS[zone.z]) * length_m, length_m))
-
-
-def _at_peak(field: xr.Dataset) -> str:
-    """Where a field's magnetic field, in T, is strongest: near the exit; empty if there is none."""
-    for name, variable in field.data_vars.items():
-        if variable.attrs.get("units") == "T" and "z" in variable.dims:
-            others = [axis for axis in variable.dims if axis != "z"]
-            strength = abs(variable.astype(float)).mean(others).values
-            peak_m = grid_points(field, "z")[int(np.nanargmax(strength))]
-            return f" ({name} is strongest at {peak_m:.4g} m, where most thrusters have their exit)"
-    return ""
 
 
 def _part_text(name: str) -> str:
@@ -429,7 +418,11 @@ def zone_averages(
 
 def in_zones(zones: Iterable[str], names: Sequence[str]) -> list[str]:
     """Names of the averages of variables over several zones, zone by zone."""
-    return [f"{name}@{zone}" for zone in zones for name in names]
+    return [_in_zone(name, zone) for zone in zones for name in names]
+
+
+def _in_zone(name: str, zone: str) -> str:
+    return f"{name}@{zone}" if zone else name
 
 
 def side_by_side(zones: Mapping[str, Zone | Sequence[float]], field: xr.Dataset) -> dict[str, Zone]:
@@ -515,18 +508,16 @@ class ZoneAverage:
 
     @property
     def _names(self) -> list[str]:
-        """Of several zones."""
+        """Of the zones; a single one is called ""."""
         if isinstance(self.zones, int):
             return [f"z{k + 1}" for k in range(self.zones)]
-        return list(self.zones or {})
+        return list(self.zones or [""])
 
     def trajectory(self, field: xr.Dataset, *, inputs: Sequence[str], label: str) -> Trajectory:
         average = partial(
             zone_average, field, states=self.states, inputs=inputs, products=self.products,
             axisymmetric=self.axisymmetric, label=label,
         )  # fmt: skip
-        if self.zones is None:
-            return average(self.zone)
         runs = {name: average(zone) for name, zone in self.parts(field).items()}
         first = next(iter(runs.values()))
         return replace(
@@ -536,13 +527,15 @@ class ZoneAverage:
             inputs=np.column_stack([run.inputs for run in runs.values()]),
             input_names=in_zones(runs, first.input_names),
             units={
-                f"{n}@{zone}": unit for zone, run in runs.items() for n, unit in run.units.items()
+                _in_zone(name, zone): unit
+                for zone, run in runs.items()
+                for name, unit in run.units.items()
             },
         )
 
     def columns(self, names: Sequence[str]) -> list[str]:
         """What the averages of variables are called in the trajectory."""
-        return list(names) if self.zones is None else in_zones(self._names, names)
+        return in_zones(self._names, names)
 
     def sizes(self, field: xr.Dataset) -> dict[str, float]:
         """Length in m of each of several zones; empty for a single one.

@@ -392,12 +392,11 @@ def read_hallthruster(path: Path) -> FileSource:
             values = columns[name]
         else:  # the fixed grid is repeated in every frame
             values = flat[0][name] if name == "z" else [frame[name] for frame in flat]
-        return xr.DataArray(np.array(values, dtype=np.float64))
+        return xr.DataArray(np.array(values, dtype=np.float64), attrs={"units": _unit(name)})
 
     names = [*inside, *(name for name in columns if name not in inside)]
-    channel_m = _channel_m(content) if isinstance(content, dict) else None
     words = f"{len(frames)} frames" if frames else "columns, no frames"
-    return FileSource(path, names, read, words=words, channel_m=channel_m, units=_units(names))
+    return FileSource(path, names, read, words=words, attributes=_channel(content))
 
 
 def _split_frames(content: Any) -> tuple[Sequence[Mapping[str, Any]], Any]:
@@ -424,18 +423,17 @@ def _is_column(value: Any) -> bool:
     return False
 
 
-def _units(names: Sequence[str]) -> dict[str, str]:
-    """Units in HallThruster.jl's output, by the last part of each path that is not an index."""
-    lasts = {name: [part for part in name.split(".") if not part.isdigit()][-1] for name in names}
-    return {name: JULIA_UNITS[last] for name, last in lasts.items() if last in JULIA_UNITS}
+def _unit(name: str) -> str:
+    """Unit in HallThruster.jl's output, by the last part of a path that is not an index."""
+    return JULIA_UNITS.get([part for part in name.split(".") if not part.isdigit()][-1], "")
 
 
-def _channel_m(content: Mapping[str, Any]) -> float | None:
+def _channel(content: Any) -> dict[str, float]:
     """Length of the channel in m, from the input that newer versions store with the output."""
     with suppress(KeyError, TypeError):
         node = content["input"]["config"]["thruster"]["geometry"]["channel_length"]
-        return float(node) if isinstance(node, int | float) else None
-    return None
+        return {"channel_m": float(node)} if isinstance(node, int | float) else {}
+    return {}
 
 
 HALLTHRUSTER = Reader("HallThruster.jl", read_hallthruster, form="other", endings=(".json",))

@@ -15,7 +15,6 @@ import pandas as pd
 import xarray as xr
 
 from ep2sindy.data.blocks import AT_ONCE, UNDECODED
-from ep2sindy.data.fields import channel_length_m
 from ep2sindy.data.numbers import count_dates
 from ep2sindy.library.units import seconds_in
 from ep2sindy.runtime.screen import words_of
@@ -29,13 +28,13 @@ Form: TypeAlias = Literal["folder", "hdf5", "zip", "other"]
 class FileSource:
     """An open file: the names of its arrays, and a function that reads one of them.
 
-    names: names of all arrays. read: reads the array of a name. dims_named: True if the arrays'
-    dimension names come from the file. aliases: further names that can be read, such as a column's
-    number. units: name -> unit, as fixed for all files of this kind. step_s: time step in s, if the
-    file gives it outside its arrays. channel_m: length of the thruster's channel in m, if the file
-    gives it. words: notes on how the file was read, shown on inspection. is_table: True if the
-    arrays are columns of a table. attributes: texts and numbers that describe the whole file.
-    steps: numbers of the steps of a run that was written step by step. kind: kind of file.
+    names: names of all arrays. read: reads the array of a name, whose attribute `units` is its
+    unit. dims_named: True if the arrays' dimension names come from the file. aliases: further names
+    that can be read, such as a column's number. step_s: time step in s, if the file gives it
+    outside its arrays. words: notes on how the file was read, shown on inspection. is_table: True
+    if the arrays are columns of a table. attributes: texts and numbers that describe the whole
+    file, such as `channel_m`, see `channel_length_m`. steps: numbers of the steps of a run that was
+    written step by step. kind: kind of file.
     """
 
     path: Path
@@ -43,9 +42,7 @@ class FileSource:
     read: Callable[[str], xr.DataArray]
     dims_named: bool = False
     aliases: Sequence[str] = ()
-    units: Mapping[str, str] = field(default_factory=dict)
     step_s: float | None = None
-    channel_m: float | None = None
     words: str = ""
     is_table: bool = False
     attributes: Mapping[str, str | float] = field(default_factory=dict)
@@ -216,7 +213,6 @@ def dataset_source(path: Path, dataset: xr.Dataset) -> FileSource:
             if packed_by.size == 1 and packed_by.dtype.kind in "iuf":
                 variable.attrs[key] = packed_by.reshape(())[()]
     dataset = xr.decode_cf(dataset, decode_coords=False, **UNDECODED)
-    length = channel_length_m(dataset.attrs)
 
     def read(name: str) -> xr.DataArray:
         check_packing(name, stored[name])
@@ -227,7 +223,7 @@ def dataset_source(path: Path, dataset: xr.Dataset) -> FileSource:
 
     attrs = {str(key): plain(value) for key, value in dataset.attrs.items()}
     attrs = {key: value for key, value in attrs.items() if isinstance(value, str | int | float)}
-    return FileSource(path, [*stored], read, dims_named=True, channel_m=length, attributes=attrs)
+    return FileSource(path, [*stored], read, dims_named=True, attributes=attrs)
 
 
 def column_array(column: pd.Series, unit: str) -> xr.DataArray:

@@ -10,7 +10,7 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import zip_longest
+from itertools import pairwise, zip_longest
 
 from ep2sindy.library.units import is_count, unit_like
 from ep2sindy.trust.memory import check_width
@@ -239,11 +239,11 @@ def header_of(above: Table, n_columns: int, *, strict: bool, is_comment: bool) -
     every column. is_comment: the last line is a comment, as programs write their header.
     Raises ValueError if it does not, or if the last line could be a row with a word in it.
     """
-    step_s = _step_s(above) if len(above) > 1 else None
+    units_above, step_s = _preamble(above, n_columns) if len(above) > 1 else ((), None)
     numbered = Header(tuple(map(str, range(n_columns))), ("",) * n_columns, step_s)
     if not above:
         return numbered
-    if len(above) > 1 and (counted := _rigol_header(above, n_columns)) is not None:
+    if (counted := _rigol_header(above, n_columns)) is not None:
         return counted
     has_units = len(above) > 1 and _are_units(above[-1], above[-2])
     names, units = (above[-2], above[-1]) if has_units else (above[-1], [])
@@ -262,7 +262,7 @@ def header_of(above: Table, n_columns: int, *, strict: bool, is_comment: bool) -
     units = [_plain(unit) for unit in (below if any(below) else (unit for _, unit in parted))]
     plain_names = _unique([name for name, _ in parted])
     if plain_names[0].lower() in TIMES and not any(units):
-        units = _preamble_units(above, n_columns)
+        units = units_above or [""] * n_columns
     return Header(plain_names, tuple(units), step_s)
 
 
@@ -292,25 +292,31 @@ def _labels_beside(header: Header, rows: Table, columns: Sequence[int]) -> Heade
 
     Older oscilloscopes of Tektronix write it there, one line in each row.
     """
-    labels = [row[: columns[0]] for row in rows]
-    by_column = dict(zip(columns, _preamble_units(labels, len(columns)), strict=True))
+    found, step_s = _preamble([row[: columns[0]] for row in rows], len(columns))
+    by_column = dict(zip(columns, found, strict=True))
     units = tuple(by_column.get(j, "") for j in range(len(header.units)))
-    return replace(header, units=units, step_s=header.step_s or _step_s(labels))
+    return replace(header, units=units, step_s=header.step_s or step_s)
 
 
-def _preamble_units(above: Table, n_columns: int) -> tuple[str, ...]:
-    """Units of the columns, time first, as lines of a preamble give them; "" where none does."""
-    time, values = "", [""]
-    for label, *cells in filter(None, above):
+def _preamble(lines: Table, n_columns: int) -> tuple[tuple[str, ...], float | None]:
+    """Units of the columns, time first, "" for none, and time step in s, as a preamble gives them.
+
+    lines: of the preamble, each a label and what it labels.
+    """
+    time, values, step_s = "", [""], None
+    for label, *cells in filter(None, lines):
         units = [_unit(cell) for cell in cells]
         while units and not units[-1]:
             units.pop()
-        if units and UNITS_OF_TIME.fullmatch(label):
+        step = cells[0].replace(",", ".") if cells and STEP.fullmatch(label) else ""
+        if step_s is None and re.fullmatch(PLAIN["."], step):
+            step_s = float(step)
+        elif units and UNITS_OF_TIME.fullmatch(label):
             time = units[0].lower() if unit_like(units[0].lower(), like="s") else units[0]
         elif units and UNITS_OF_VALUES.fullmatch(label):
             values = units
     values = values * (n_columns - 1) if len(values) == 1 else values
-    return _known_units([time, *values], n_columns)
+    return _known_units([time, *values], n_columns), step_s
 
 
 def _known_units(cells: Sequence[str], n_columns: int) -> tuple[str, ...]:
@@ -319,23 +325,14 @@ def _known_units(cells: Sequence[str], n_columns: int) -> tuple[str, ...]:
     return tuple([*units, *[""] * n_columns][:n_columns])
 
 
-def _step_s(above: Table) -> float | None:
-    """Time step in s from a preamble, or None."""
-    for cells in above:
-        if len(cells) > 1 and STEP.fullmatch(cells[0]):
-            step = cells[1].replace(",", ".")
-            return float(step) if re.fullmatch(PLAIN["."], step) else None
-    return None
-
-
 def split_name(name: str) -> tuple[str, str]:
     """Split a name and its unit; a text in brackets that is not a unit stays in the name."""
     for pattern in WITH_UNIT:
-        found = pattern.fullmatch(name)
-        if found and unit_like(_plain(found[2])):
-            return found[1].strip(), _plain(found[2])
-    found = WITH_UNIT[0].fullmatch(name)
-    return (found[1].strip(), found[2].strip()) if found and is_count(found[2]) else (name, "")
+        if found := pattern.fullmatch(name):
+            unit = _plain(found[2])
+            if unit_like(unit) or (pattern is WITH_UNIT[0] and is_count(unit)):
+                return found[1].strip(), unit
+    return name, ""
 
 
 def unit_in_brackets(name: str) -> str:
@@ -380,13 +377,10 @@ def _rigol_header(above: Table, n_columns: int) -> Header | None:
     Its first column numbers the samples. The last cells of its two header lines give the start and
     the increment of time.
     """
-    for k, cells in enumerate(above):
-        words = [cell.lower() for cell in cells]
-        below = dict(zip(words, above[k + 1] if k + 1 < len(above) else [], strict=False))
-        step = below.get("increment", "")
-        if len(words) > n_columns and re.fullmatch(PLAIN["."], step):
-            units = _known_units(above[k + 1], n_columns)
-            return Header(_unique(cells[:n_columns]), units, float(step))
+    for cells, below in pairwise(above):
+        step = dict(zip(map(str.lower, cells), below, strict=False)).get("increment", "")
+        if len(cells) > n_columns and re.fullmatch(PLAIN["."], step):
+            return Header(_unique(cells[:n_columns]), _known_units(below, n_columns), float(step))
     return None
 
 
