@@ -188,16 +188,6 @@ def follow(problem: RefinementProblem, fit: RefinementFit) -> tuple[RefinementFi
     return replace(fit, nodes=nodes, finite=finite, maps=None), maps
 
 
-def follow_windows(problem: RefinementProblem, fit: RefinementFit) -> np.ndarray:
-    """Trajectories from the fitted starts, (points, windows, samples, n_states).
-
-    NaN in windows whose gaps do not close.
-    """
-    nodes, gaps, _ = close_gaps(problem, fit)
-    nodes[~(gaps < CLOSED)] = np.nan
-    return nodes
-
-
 def close_gaps(
     problem: RefinementProblem, fit: RefinementFit
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

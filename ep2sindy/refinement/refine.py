@@ -20,10 +20,8 @@ from ep2sindy.refinement.assess import (
     RefinementVerdict,
     failure,
     fit_and_assess,
-    follow_windows,
 )
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
-from ep2sindy.refinement.ode import all_fixed
 from ep2sindy.refinement.problem import (
     Iteration,
     Method,
@@ -360,36 +358,3 @@ def refine_batch(
         losses.append(np.where(fit.finite, loss, np.inf))
         advance(len(chunk))
     return BatchRefinement(refined, np.concatenate(finished), np.concatenate(losses))
-
-
-def smooth_batch(
-    models: Sequence[SparseModel],
-    batch: WindowBatch,
-    *,
-    method: Method,
-    points_per_batch: int = 8,
-    advance: Advance = nothing,
-) -> Float[np.ndarray, "models windows samples n_states"]:
-    """Trajectories that follow the windows best, with starts fitted and coefficients fixed.
-
-    They are in units of the batch's scale; NaN in windows where a model blows up.
-    points_per_batch: as for `refine`, where models may also differ in their terms. advance:
-    called with the number of models finished.
-    Raises ValueError for a model without terms.
-    """
-    windows = batch.split()
-    paths = []
-    for some in _chunks(len(models), points_per_batch):
-        chunk = models[some]
-        by_model = RefinementProblem.of(
-            chunk, [batch] * len(chunk), [all_fixed(model) for model in chunk]
-        )
-        # Every window is a separate point, so one that blows up does not stop the others.
-        problem = replace(
-            by_model,
-            equations=tuple(each for each in by_model.equations for _ in windows),
-            batches=tuple(windows * len(chunk)),
-        )
-        paths.append(follow_windows(problem, method.fit(problem)))
-        advance(len(chunk))
-    return np.concatenate(paths).reshape(len(models), *batch.data.shape)

@@ -11,8 +11,9 @@ from jaxtyping import Float
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.model.model import SparseModel
-from ep2sindy.refinement.refine import BatchRefinement, smooth_batch
-from ep2sindy.refinement.windows import MIN_SAMPLES, WindowBatch, dominant_window
+from ep2sindy.model.restarts import Restarts
+from ep2sindy.refinement.refine import BatchRefinement
+from ep2sindy.refinement.windows import MIN_SAMPLES, dominant_window
 from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.selection.criteria import FLOOR, MAX_ERROR
 from ep2sindy.selection.systems import (
@@ -21,9 +22,7 @@ from ep2sindy.selection.systems import (
     Segment,
     Trial,
     TrialSystem,
-    cut_segments,
     deal,
-    plan_refinement,
 )
 
 # Fewest pairs of windows to cut the records into.
@@ -100,7 +99,6 @@ class WindowsLeftOut:
         self,
         systems: Sequence[TrialSystem],
         refined: BatchRefinement,
-        fitted: WindowBatch,
         fold: Fold,
         progress: Progress,
     ) -> Float[np.ndarray, "systems windows samples n_states"]:
@@ -108,15 +106,34 @@ class WindowsLeftOut:
         models, before = list(refined.models), [system.model for system in systems]
         doubtful = np.flatnonzero(~refined.finished)
         worse, better = (
-            _bounded_squares(_residuals([each[k] for k in doubtful], fitted)).mean(axis=(1, 2))
+            _bounded_squares(self._distances([each[k] for k in doubtful], fold.fitted)).mean(
+                axis=(1, 2)
+            )
             for each in (models, before)
         )
         for k in doubtful[worse >= better]:
             models[k] = before[k]
-        held = cut_segments(
-            self.runs, fold.held, before[0], window=self.window, n_windows=self.count(fold.held)
-        )
-        return _residuals(models, held, progress) * (held.scale[: len(self.spread)] / self.spread)
+        return self._distances(models, fold.held, progress)
+
+    def _distances(
+        self,
+        models: Sequence[SparseModel],
+        windows: Sequence[Segment],
+        progress: Progress = SILENT,
+    ) -> Float[np.ndarray, "models windows samples n_states"]:
+        """Distances of runs from starts that are fitted, in `spread`; NaN once one diverges."""
+        number, first = np.array([(window.run, window.start) for window in windows]).T
+        found = np.empty((len(models), len(windows), self.window, len(self.states)))
+        with progress.stage(len(models), "system", "starts of windows held out") as advance:
+            for model, distances in zip(models, found, strict=True):
+                for k in np.unique(number).tolist():
+                    along, own = Restarts(model, self.runs[k]), number == k
+                    starts = along.fitted(first[own], self.window - 1)
+                    paths = along.paths(starts, first[own], self.window - 1)
+                    samples = along.samples[first[own, None] + np.arange(self.window)]
+                    distances[own] = (paths - samples) / self.spread
+                advance(1)
+        return found
 
     def figures(self, tried: Sequence[np.ndarray]) -> Float[np.ndarray, "systems 5"]:
         """Errors in units of their bound, zero up to the bound, as those systems are alike."""
@@ -129,20 +146,6 @@ class WindowsLeftOut:
         """A system is confirmed if its coefficients, refined on all data, meet the demands."""
         broken = trial.system.broken(model)
         return ConfirmedSystem(trial, model, broken, fraction=float(not broken))
-
-
-def _residuals(
-    models: Sequence[SparseModel], batch: WindowBatch, progress: Progress = SILENT
-) -> Float[np.ndarray, "models windows samples n_states"]:
-    """Distances of the best trajectories to the samples, in the batch's scale; NaN if none."""
-    if not models:
-        return np.empty((0, *batch.data.shape))
-    method, together = plan_refinement(batch, models[0].library)
-    with progress.stage(len(models), "system", "starts of windows held out") as advance:
-        return (
-            smooth_batch(models, batch, method=method, points_per_batch=together, advance=advance)
-            - batch.data
-        )
 
 
 def _errors_and_bound(

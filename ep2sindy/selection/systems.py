@@ -12,7 +12,6 @@ from jaxtyping import Float, Int
 from ep2sindy.data.coerce import DiscoveryProblem
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.forecasting.evaluation import Evaluation
-from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Constraint, Process, binding, constraint
 from ep2sindy.library.roles import process_amounts
 from ep2sindy.model.model import SparseModel, model_of
@@ -254,23 +253,16 @@ def cut_segments(
     return cut_windows(pieces, model, n_windows=n_windows, window=length, rng=seed)
 
 
-def plan_refinement(batch: WindowBatch, library: Library) -> tuple[MultipleShooting, int]:
-    """Refinement method for systems to be assessed, and how many to refine together.
+def refine_systems(
+    systems: Sequence[TrialSystem], batch: WindowBatch, progress: Progress, *, n_reweights: int
+) -> BatchRefinement:
+    """Every system refined on the same windows. Raises ValueError for one without terms.
 
     The regression's coefficients are close, so whole windows are fitted at once in few iterations.
     Systems that need more are the wrong ones.
     """
-    method = MultipleShooting(
-        step=fastest_step(library), first_memory=batch.data.shape[1], tolerance=1e-3, max_iter=10
-    )
-    return method, max(1, BATCH_STEPS // batch.steps.size)
-
-
-def refine_systems(
-    systems: Sequence[TrialSystem], batch: WindowBatch, progress: Progress, *, n_reweights: int
-) -> BatchRefinement:
-    """Every system refined on the same windows. Raises ValueError for one without terms."""
-    method, together = plan_refinement(batch, systems[0].model.library)
+    step, n_samples = fastest_step(systems[0].model.library), batch.data.shape[1]
+    method = MultipleShooting(step=step, first_memory=n_samples, tolerance=1e-3, max_iter=10)
     with progress.stage(len(systems), "system", "refined without a fold") as advance:
         return refine_batch(
             [system.model for system in systems],
@@ -278,7 +270,7 @@ def refine_systems(
             method=method,
             constraints=[system.constraint for system in systems],
             n_reweights=n_reweights,
-            points_per_batch=together,
+            points_per_batch=max(1, BATCH_STEPS // batch.steps.size),
             advance=advance,
         )
 
