@@ -5,16 +5,14 @@ import pytest
 
 import ep2sindy as ep
 from ep2sindy.data.coerce import DiscoveryProblem
-from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.ode import unconstrained
-from ep2sindy.refinement.refine import BatchRefinement, refine_batch
 from ep2sindy.refinement.windows import WindowBatch, cut_windows
 from ep2sindy.regression.front import Candidate, ParetoFront
 from ep2sindy.runtime.progress import SILENT
 from ep2sindy.selection import by_windows, systems
 from ep2sindy.selection.by_windows import WindowsLeftOut
 from ep2sindy.selection.criteria import MAX_ERROR
-from ep2sindy.selection.systems import Fold
+from ep2sindy.selection.systems import BatchRefinement, Fold, TrialSystem, refine_systems
 from ep2sindy.systems.draws import realization
 from ep2sindy.systems.systems import System, damped_oscillator
 from tests.models import plain_rows
@@ -206,9 +204,9 @@ def test_a_refinement_that_fails_leaves_the_model_and_the_others_as_they_were() 
     )
     sound = ep.SparseModel(library, ["x", "y"], ep.model.coef_matrix(library, list(truth.values())))
     batch = cut_windows([PREY.trajectory()], PREY.model, n_windows=3, window=50, rng=1)
-    found = refine_batch([wild, sound], batch, method=MultipleShooting())
+    trials = [TrialSystem(each, unconstrained(each)) for each in (wild, sound)]
+    found = refine_systems(trials, batch)
     kept, good = found.models
-    assert found.finished.tolist() == [False, True]
     assert found.loss[0] == np.inf
     assert found.loss[1] < 1e-8
     np.testing.assert_array_equal(kept.coef, wild.coef)
@@ -221,8 +219,8 @@ def test_windows_left_out_are_followed_from_fitted_starts() -> None:
     wild = ep.SparseModel(PREY.model.library, ["x", "y"], 1e9 * PREY.model.coef)
     measure = WindowsLeftOut([run], np.ones(2), ["x", "y"], 8, 2)
     models, (fold, _) = [PREY.model, wild], measure.folds
-    held = BatchRefinement(models, np.ones(2, dtype=np.bool_), np.ones(2))
-    trials = [systems.TrialSystem(each, unconstrained(each)) for each in models]
+    held = BatchRefinement(models, np.ones(2))
+    trials = [TrialSystem(each, unconstrained(each)) for each in models]
     followed, lost = measure.assess(trials, held, fold, SILENT)
     assert followed.shape == (len(fold.held), measure.window, 2)
     half = replace(measure, spread=2.0 * measure.spread)

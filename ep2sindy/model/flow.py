@@ -98,7 +98,7 @@ def _in_arrays(
         return np.concatenate([both[:, :, :1], tangents], axis=2)
 
     for k in range(0, len(steps.inputs) - 1, CLASSICAL.stride):
-        whole = step(rates, whole, steps.inputs[k : k + 3], steps.h[:, None, None])
+        whole = step(rates, whole, [*steps.inputs[k : k + 3]], steps.h[:, None, None])
     slopes[:, :, :n_tangents] = whole[:, :, 1:]
     return whole[:, :, 0]
 

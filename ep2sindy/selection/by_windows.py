@@ -12,11 +12,11 @@ from jaxtyping import Float
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.restarts import Restarts
-from ep2sindy.refinement.refine import BatchRefinement
 from ep2sindy.refinement.windows import MIN_SAMPLES, dominant_window
 from ep2sindy.runtime.progress import Progress
 from ep2sindy.selection.criteria import FLOOR, MAX_ERROR
 from ep2sindy.selection.systems import (
+    BatchRefinement,
     ConfirmedSystem,
     Fold,
     Segment,
