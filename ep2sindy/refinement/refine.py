@@ -15,12 +15,7 @@ from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.relations import Constraint
 from ep2sindy.model.display import model_html, model_lines
 from ep2sindy.model.model import SparseModel
-from ep2sindy.refinement.assess import (
-    RefinementStatus,
-    RefinementVerdict,
-    failure,
-    fit_and_assess,
-)
+from ep2sindy.refinement.assess import RefinementStatus, RefinementVerdict, failure, fit_and_assess
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.problem import (
     Iteration,
@@ -210,8 +205,7 @@ def refine(
 
 
 def _by_model(
-    model: SparseModel | Sequence[SparseModel],
-    trajectories: Runs | Sequence[Sequence[Trajectory]],
+    model: SparseModel | Sequence[SparseModel], trajectories: Runs | Sequence[Sequence[Trajectory]]
 ) -> tuple[Sequence[SparseModel], Sequence[Sequence[Trajectory]]]:
     """Arguments of `refine` as a list of models and the trajectories of each."""
     if isinstance(model, SparseModel):
