@@ -6,7 +6,6 @@ from functools import cache
 
 import numpy as np
 import pytest
-from ep2sindy.studies.law_tables import FoundLaw
 
 import ep2sindy as ep
 from ep2sindy.model.comparison import Status
@@ -22,6 +21,7 @@ from ep2sindy.operating.point_fits import PointFits, fit_rows, fit_trajectories
 from ep2sindy.operating.records import OperatingRecord, branches_of
 from ep2sindy.regression.pooled import Basis, fewest_of_least, invert_covariance
 from ep2sindy.regression.rows import RegressionRows
+from ep2sindy.studies.law_tables import FoundLaw
 from tests.models import plain_rows
 
 STATES = ("x", "y")

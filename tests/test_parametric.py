@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from ep2sindy.operating.given_models import FittingSettings, GivenModel, PointResult, fit_models
 from scipy.integrate import solve_ivp
 from scipy.signal import lfilter
 
 import ep2sindy as ep
+from ep2sindy.operating.given_models import FittingSettings, GivenModel, PointResult, fit_models
 from ep2sindy.operating.law import constrain_law
 from ep2sindy.operating.quantities import (
     Quantity,
