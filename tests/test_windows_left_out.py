@@ -5,15 +5,14 @@ import pytest
 
 import ep2sindy as ep
 from ep2sindy.data.coerce import DiscoveryProblem
-from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
 from ep2sindy.refinement.ode import unconstrained
-from ep2sindy.refinement.refine import BatchRefinement, refine_batch, smooth_batch
 from ep2sindy.refinement.windows import WindowBatch, cut_windows
 from ep2sindy.regression.front import Candidate, ParetoFront
 from ep2sindy.runtime.progress import SILENT
 from ep2sindy.selection import by_windows, systems
 from ep2sindy.selection.by_windows import WindowsLeftOut
 from ep2sindy.selection.criteria import MAX_ERROR
+from ep2sindy.selection.systems import BatchRefinement, Fold, TrialSystem, refine_systems
 from ep2sindy.systems.draws import realization
 from ep2sindy.systems.systems import System, damped_oscillator
 from tests.models import plain_rows
@@ -151,32 +150,34 @@ def test_a_combination_that_diverges_gets_the_largest_error() -> None:
 
 
 def test_what_refines_does_not_assess(monkeypatch: pytest.MonkeyPatch) -> None:
-    batches: list[WindowBatch] = []
-    pieces: list[list[ep.Trajectory]] = []
+    fitted: list[np.ndarray] = []
+    held: list[np.ndarray] = []
 
     def seen(runs: list[ep.Trajectory], model: ep.SparseModel, **settings: object) -> WindowBatch:
-        pieces.append(runs)
-        batches.append(cut_windows(runs, model, **settings))
-        return batches[-1]
+        batch = cut_windows(runs, model, **settings)
+        places, n = zip(batch.trajectory, batch.start, strict=True), batch.data.shape[1]
+        fitted.append(np.concatenate([runs[j].t[k : k + n] for j, k in places]))
+        return batch
 
+    def assess(
+        measure: WindowsLeftOut, trials: list, refined: object, fold: Fold, *rest: object
+    ) -> np.ndarray:
+        times = [measure.runs[w.run].t[w.start : w.stop] for w in fold.held]
+        held.append(np.concatenate(times))
+        return assess_held(measure, trials, refined, fold, *rest)
+
+    assess_held = WindowsLeftOut.assess
     monkeypatch.setattr(systems, "cut_windows", seen)
+    monkeypatch.setattr(WindowsLeftOut, "assess", assess)
     run = PREY.trajectory()
     parts = [run.window(0, 450), run.window(600, 990)]
     choices = {s: [PREY.model.terms(s)] for s in PREY.model.states}
     fronts = fronts_of(parts, PREY.model.library, choices)
     assert picked(replace(RULE, n_windows=10), fronts) == supports(PREY)
-    times = [
-        np.concatenate(
-            [run[j].t[k : k + batch.data.shape[1]] for j, k in zip(
-                batch.trajectory, batch.start, strict=True
-            )]
-        )
-        for run, batch in zip(pieces, batches, strict=True)
-    ]  # fmt: skip
-    assert len(times) == 6
-    for fitted, held in zip(times[::2], times[1::2], strict=True):
-        assert not set(fitted) & set(held)
-        assert len(set(held)) == len(held)
+    assert len(fitted) == len(held) == 3
+    for own, others in zip(held, fitted, strict=True):
+        assert not set(own) & set(others)
+        assert len(set(own)) == len(own)
 
 
 def test_two_windows_refine_and_assess_by_turns() -> None:
@@ -195,24 +196,6 @@ def test_windows_without_a_jump_do_not_decide_alone(number: int) -> None:
     assert picked(RULE, fronts_of([run], system.model.library, choices)) == supports(system)
 
 
-def batch_of(run: ep.Trajectory, *, n_windows: int = 3, window: int = 50) -> WindowBatch:
-    return cut_windows([run], PREY.model, n_windows=n_windows, window=window, rng=1)
-
-
-def test_paths_of_several_models_are_smoothed_as_each_by_itself() -> None:
-    run = PREY.trajectory(noise=0.05, rng=np.random.default_rng(0))
-    batch, method = batch_of(run, n_windows=4, window=100), MultipleShooting()
-    wider = [{"1": 0.1, "x": 0.5, "x*y": -0.9, "x^2": 0.01}, {"y": -0.3, "x*y": 0.9}]
-    library = PREY.model.library
-    models = [PREY.model, ep.SparseModel(library, ["x", "y"], ep.model.coef_matrix(library, wider))]
-    paths = smooth_batch(models, batch, method=method)
-    for k, model in enumerate(models):
-        (path,) = smooth_batch([model], batch, method=method)
-        np.testing.assert_allclose(paths[k], path, rtol=1e-8, equal_nan=True)
-    # A fit of the starts alone is one of the noise alone, where the model is right.
-    assert np.square(paths[0] - batch.data).mean() == pytest.approx(0.05**2 * 2.0, rel=0.5)
-
-
 def test_a_refinement_that_fails_leaves_the_model_and_the_others_as_they_were() -> None:
     library = ep.polynomial(["x", "y"], degree=4)
     truth = {s: PREY.model.terms(s) for s in ("x", "y")}
@@ -220,37 +203,31 @@ def test_a_refinement_that_fails_leaves_the_model_and_the_others_as_they_were() 
         library, ["x", "y"], ep.model.coef_matrix(library, [{"x^2*y^2": 1e200}, {"y": 1e3}])
     )
     sound = ep.SparseModel(library, ["x", "y"], ep.model.coef_matrix(library, list(truth.values())))
-    batch = batch_of(PREY.trajectory())
-    found = refine_batch([wild, sound], batch, method=MultipleShooting())
+    batch = cut_windows([PREY.trajectory()], PREY.model, n_windows=3, window=50, rng=1)
+    trials = [TrialSystem(each, unconstrained(each)) for each in (wild, sound)]
+    found = refine_systems(trials, batch)
     kept, good = found.models
-    assert found.finished.tolist() == [False, True]
     assert found.loss[0] == np.inf
     assert found.loss[1] < 1e-8
     np.testing.assert_array_equal(kept.coef, wild.coef)
     np.testing.assert_allclose(good.coef, sound.coef, rtol=1e-5, atol=1e-12)
-    paths = smooth_batch([wild, sound], batch, method=MultipleShooting())
-    assert np.isnan(paths[0]).all()
-    assert np.square(paths[1] - batch.data).mean() < 1e-8
 
 
-def test_a_refinement_that_ends_worse_than_it_began_is_not_kept() -> None:
-    off = replace(PREY.model, coef=1.2 * PREY.model.coef)
-
-    better, worse = PREY.model, replace(PREY.model, coef=2.0 * PREY.model.coef)
-    refined = BatchRefinement([better, worse], np.zeros(2, dtype=np.bool_), np.ones(2))
-    run = PREY.trajectory()
-    batch, fold = batch_of(run), systems.Fold([systems.Segment(0, 0, 300)], [])
-    trial = systems.TrialSystem(off, unconstrained(off))
-    measure = WindowsLeftOut([run], run.states.std(axis=0), ["x", "y"], 2, 2)
-    mended, spoilt = measure.assess([trial, trial], refined, batch, fold, SILENT)
-    assert np.abs(mended).max() < 1e-3
+def test_windows_left_out_are_followed_from_fitted_starts() -> None:
+    """Of the right model the noise alone is left; one that blows up is nowhere."""
+    run = PREY.trajectory(noise=0.05, rng=np.random.default_rng(0))
+    wild = ep.SparseModel(PREY.model.library, ["x", "y"], 1e9 * PREY.model.coef)
+    measure = WindowsLeftOut([run], np.ones(2), ["x", "y"], 8, 2)
+    models, (fold, _) = [PREY.model, wild], measure.folds
+    held = BatchRefinement(models, np.ones(2))
+    trials = [TrialSystem(each, unconstrained(each)) for each in models]
+    followed, lost = measure.assess(trials, held, fold, SILENT)
+    assert followed.shape == (len(fold.held), measure.window, 2)
     half = replace(measure, spread=2.0 * measure.spread)
-    again = half.assess([trial, trial], refined, batch, fold, SILENT)
-    np.testing.assert_allclose(again, 0.5 * np.array([mended, spoilt]), rtol=1e-12)
-    same = BatchRefinement([off, off], np.ones(2, dtype=np.bool_), np.ones(2))
-    np.testing.assert_array_equal(
-        spoilt, measure.assess([trial, trial], same, batch, fold, SILENT)[1]
-    )
+    np.testing.assert_array_equal(half.assess(trials, held, fold, SILENT)[0], 0.5 * followed)
+    noise = (run.states - PREY.trajectory().states).std(axis=0)
+    assert np.square(followed / noise).mean() == pytest.approx(1.0, rel=0.2)
+    assert not np.isfinite(lost[:, -1]).any()
 
 
 def pieces_of(*lengths: int) -> list[ep.Trajectory]:

@@ -33,12 +33,7 @@ from ep2sindy.model.fixed_point import UNDETERMINED, RestPoint, rest_points
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.restarts import OneStep, one_step
 from ep2sindy.model.rollout import Rollout
-from ep2sindy.model.stability import (
-    LimitCycle,
-    end_of_long_run,
-    limit_cycle,
-    multiplier_error,
-)
+from ep2sindy.model.stability import LimitCycle, end_of_long_run, limit_cycle, multiplier_error
 from ep2sindy.runtime.screen import WIDTH, html_table, one_screen, text_table
 from ep2sindy.runtime.values import check_kind
 from ep2sindy.signals.attractor import LEAST_FOR_NOISE, follow_phase

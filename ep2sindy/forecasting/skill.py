@@ -31,13 +31,7 @@ from ep2sindy.forecasting.baselines import (
     squared_errors,
     standard_error,
 )
-from ep2sindy.forecasting.forecast import (
-    LEVEL,
-    Forecast,
-    RollingStarts,
-    StatesOf,
-    calibrate,
-)
+from ep2sindy.forecasting.forecast import LEVEL, Forecast, RollingStarts, StatesOf, calibrate
 from ep2sindy.forecasting.state_estimation import StateEstimator, tune_estimator
 from ep2sindy.model.model import SparseModel
 from ep2sindy.runtime.progress import Progress, as_progress

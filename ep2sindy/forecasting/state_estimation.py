@@ -29,12 +29,7 @@ from ep2sindy.estimation.likelihood import (
     fit_paths,
     linearise,
 )
-from ep2sindy.estimation.problem import (
-    MIN_SAMPLES,
-    EstimationProblem,
-    ScaledRecord,
-    scale_problem,
-)
+from ep2sindy.estimation.problem import MIN_SAMPLES, EstimationProblem, ScaledRecord, scale_problem
 from ep2sindy.estimation.process_noise import LEAST_NOISE, MOST, likely_errors
 from ep2sindy.model.model import SparseModel
 from ep2sindy.runtime.progress import Progress, as_progress, count_pieces

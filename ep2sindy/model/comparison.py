@@ -11,12 +11,7 @@ from jaxtyping import Float
 
 from ep2sindy.data.numbers import zero_to_one
 from ep2sindy.data.trajectory import Trajectory
-from ep2sindy.signals.attractor import (
-    Cycle,
-    find_cycle,
-    waveform_errors,
-    white_variance,
-)
+from ep2sindy.signals.attractor import Cycle, find_cycle, waveform_errors, white_variance
 from ep2sindy.signals.spectrum import DECAYED, dominant_frequency, has_decayed, power_spectrum
 
 LONG = 8.0  # fewest periods in a record whose first half may be left out as a transient

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ep2sindy.model.flow_kernels import advance, sums_of_products
-from ep2sindy.model.runge_kutta import CLASSICAL
+from ep2sindy.model.runge_kutta import CLASSICAL, step
 from ep2sindy.model.vector_field import VectorField
 
 # Equation and term of each coefficient by which a flow is differentiated.
@@ -82,31 +82,25 @@ def _compiled(
 def _in_arrays(
     field: VectorField, states: AtSteps, steps: Steps, by: Coefficients, slopes: Slopes
 ) -> AtSteps:
-    """`_compiled` for libraries with functions, which are evaluated at all samples at once.
-
-    The tangents T of a state follow T' = (df/dx) T, and those by a coefficient gain its term.
-    """
-    (n, d), (equation, term), wanted = states.shape, by, slopes.shape[2] > 0
+    """`_compiled` for libraries with functions, which are evaluated at all samples at once."""
+    (n, d), (equation, term) = states.shape, by
     weights, own = field.weights.reshape(d * (1 + d), -1).T, field.places[term]
-    columns = d + np.arange(len(term))
-    total = slopes[:, :, : d + len(term)]
-    if wanted:
-        total[:, np.arange(d), np.arange(d)] = 1.0
-    leads = CLASSICAL.leads.sum(axis=1)  # each stage leads on from the one before alone
+    n_tangents = min(d + len(term), slopes.shape[2])
+    whole = np.eye(d, 1 + n_tangents, 1) + np.zeros((n, 1, 1))
+    whole[:, :, 0] = states
+
+    def rates(whole: np.ndarray, inputs: np.ndarray) -> np.ndarray:
+        """Of the states, and of the tangents T behind them, T' = (df/dx) T + df/dc."""
+        products = field.products.evaluate(np.concatenate([whole[:, :, 0], inputs], axis=1))
+        both = (products @ weights).reshape(n, d, 1 + d)
+        tangents = both[:, :, 1:] @ whole[:, :, 1:]
+        tangents[:, equation, d + np.arange(len(term))] += products[:, own]
+        return np.concatenate([both[:, :, :1], tangents], axis=2)
+
     for k in range(0, len(steps.inputs) - 1, CLASSICAL.stride):
-        start, slope, begun, change = states, np.zeros_like(states), total.copy(), 0.0
-        for lead, weight, place in zip(leads, CLASSICAL.weights, CLASSICAL.places, strict=True):
-            ahead, own_step = (lead * steps.h)[:, None], (weight * steps.h)[:, None]
-            values = np.concatenate([start + ahead * slope, steps.inputs[k + place]], axis=1)
-            products = field.products.evaluate(values)
-            both = (products @ weights).reshape(n, d, 1 + d)
-            slope = both[:, :, 0]
-            states = states + own_step * slope
-            if wanted:
-                change = both[:, :, 1:] @ (begun + ahead[:, None] * change)
-                change[:, equation, columns] += products[:, own]
-                total += own_step[:, None] * change
-    return states
+        whole = step(rates, whole, [*steps.inputs[k : k + 3]], steps.h[:, None, None])
+    slopes[:, :, :n_tangents] = whole[:, :, 1:]
+    return whole[:, :, 0]
 
 
 def _route(field: VectorField) -> Callable[..., AtSteps]:

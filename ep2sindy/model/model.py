@@ -172,9 +172,7 @@ class SparseModel:
         }
 
     def derivative(
-        self,
-        states: Float[np.ndarray, "... n_states"],
-        inputs: Float[np.ndarray, "... n_inputs"],
+        self, states: Float[np.ndarray, "... n_states"], inputs: Float[np.ndarray, "... n_inputs"]
     ) -> Float[np.ndarray, "... n_states"]:
         """Right-hand side at any number of samples; inputs are in the order of `inputs`.
 

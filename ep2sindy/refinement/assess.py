@@ -50,12 +50,7 @@ class RefinementStatus(StrEnum):
 
 
 def status_of(
-    *,
-    finite: bool,
-    flat: bool,
-    unidentifiable: bool,
-    coarse: Callable[[], bool],
-    settled: bool,
+    *, finite: bool, flat: bool, unidentifiable: bool, coarse: Callable[[], bool], settled: bool
 ) -> RefinementStatus:
     """The first status that applies, in the order of the arguments.
 
@@ -188,16 +183,6 @@ def follow(problem: RefinementProblem, fit: RefinementFit) -> tuple[RefinementFi
     return replace(fit, nodes=nodes, finite=finite, maps=None), maps
 
 
-def follow_windows(problem: RefinementProblem, fit: RefinementFit) -> np.ndarray:
-    """Trajectories from the fitted starts, (points, windows, samples, n_states).
-
-    NaN in windows whose gaps do not close.
-    """
-    nodes, gaps, _ = close_gaps(problem, fit)
-    nodes[~(gaps < CLOSED)] = np.nan
-    return nodes
-
-
 def close_gaps(
     problem: RefinementProblem, fit: RefinementFit
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -231,10 +216,7 @@ def rollout(problem: RefinementProblem, fit: RefinementFit, *, n_substeps: int =
     start = torch.tensor(fit.nodes[:, :, 0].transpose(0, 2, 1).copy(), device=problem.device)
     with torch.inference_mode():
         path = integrate(
-            problem.ode,
-            start[:, None],
-            n_segments=fit.nodes.shape[2] - 1,
-            n_substeps=n_substeps,
+            problem.ode, start[:, None], n_segments=fit.nodes.shape[2] - 1, n_substeps=n_substeps
         )
     return path[:, :, 0].permute(1, 3, 0, 2).cpu().numpy()
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -279,14 +279,6 @@ def _weights(points: Sequence[ScaledEquations]) -> tuple[Library, np.ndarray, np
 def unconstrained(model: SparseModel) -> Constraint:
     """Constraint that leaves every nonzero coefficient of a model free."""
     return build_constraint(model.library, {s: tuple(model.terms(s)) for s in model.states})
-
-
-def all_fixed(model: SparseModel) -> Constraint:
-    """Constraint that fixes every nonzero coefficient of a model."""
-    every = unconstrained(model)
-    values = _coef(model, every)
-    nothing = np.empty(0, dtype=np.int64)
-    return replace(every, C=np.empty((len(values), 0)), d=values, free=nothing)
 
 
 def _coef(model: SparseModel, relations: Constraint) -> np.ndarray:

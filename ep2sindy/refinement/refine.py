@@ -8,25 +8,17 @@ from dataclasses import dataclass, replace
 from typing import Any, Unpack, cast, overload
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from ep2sindy.data.runs import Runs, is_run, trajectories_of
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.library.relations import Constraint
 from ep2sindy.model.display import model_html, model_lines
 from ep2sindy.model.model import SparseModel
-from ep2sindy.refinement.assess import (
-    RefinementStatus,
-    RefinementVerdict,
-    failure,
-    fit_and_assess,
-    follow_windows,
-)
+from ep2sindy.refinement.assess import RefinementStatus, RefinementVerdict, failure, fit_and_assess
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
-from ep2sindy.refinement.ode import all_fixed
 from ep2sindy.refinement.problem import (
     Iteration,
-    Method,
     RefinementChanges,
     RefinementFit,
     RefinementProblem,
@@ -35,7 +27,7 @@ from ep2sindy.refinement.problem import (
 )
 from ep2sindy.refinement.windows import WindowBatch
 from ep2sindy.regression.constrained import place_coefficients
-from ep2sindy.runtime.progress import Advance, Progress, as_progress, nothing
+from ep2sindy.runtime.progress import Progress, as_progress
 from ep2sindy.runtime.screen import N_LINES, one_screen
 from ep2sindy.runtime.threads import one_thread
 from ep2sindy.runtime.values import check_kind
@@ -213,8 +205,7 @@ def refine(
 
 
 def _by_model(
-    model: SparseModel | Sequence[SparseModel],
-    trajectories: Runs | Sequence[Sequence[Trajectory]],
+    model: SparseModel | Sequence[SparseModel], trajectories: Runs | Sequence[Sequence[Trajectory]]
 ) -> tuple[Sequence[SparseModel], Sequence[Sequence[Trajectory]]]:
     """Arguments of `refine` as a list of models and the trajectories of each."""
     if isinstance(model, SparseModel):
@@ -307,89 +298,3 @@ def with_coef(
     places = constraint.coefficients
     coef, used = place_coefficients(model.library, model.states, places, values)
     return replace(model, coef=coef, covariance=None), used
-
-
-@dataclass(frozen=True, eq=False)
-class BatchRefinement:
-    """Models refined on the same windows, without assessment.
-
-    finished: true for models that met the method's own convergence test. loss: mean square of
-    (trajectory - data) in the batch's scale. If a refinement did not stay finite, the loss is
-    infinite and the model is returned unchanged.
-    """
-
-    models: Sequence[SparseModel]
-    finished: Bool[np.ndarray, " models"]
-    loss: Float[np.ndarray, " models"]
-
-
-@one_thread()
-def refine_batch(
-    models: Sequence[SparseModel],
-    batch: WindowBatch,
-    *,
-    method: Method,
-    constraints: Sequence[Constraint] | None = None,
-    n_reweights: int = 1,
-    points_per_batch: int = 8,
-    advance: Advance = nothing,
-) -> BatchRefinement:
-    """Refine models of the same states on the same windows, with free starts, unassessed.
-
-    constraints: one per model; None leaves all coefficients free. points_per_batch: as for
-    `refine`, where models may also differ in their terms. advance: called with the number of
-    models finished.
-    Raises ValueError for a model without terms.
-    """
-    relations = [None] * len(models) if constraints is None else constraints
-    refined: list[SparseModel] = []
-    finished, losses = [], []
-    for some in _chunks(len(models), points_per_batch):
-        chunk = models[some]
-        problem = RefinementProblem.of(
-            chunk, [batch] * len(chunk), relations[some], n_reweights=n_reweights
-        )
-        fit = method.fit(problem)
-        for p, (model, equations) in enumerate(zip(chunk, problem.equations, strict=True)):
-            values = equations.coef(fit.scaling[p, : equations.n_free])
-            moved, _ = with_coef(model, equations.relations, values)
-            refined.append(moved if fit.finite[p] else model)
-        finished.append(fit.finished & fit.finite)
-        with np.errstate(over="ignore", invalid="ignore"):
-            loss = np.square(fit.nodes - problem.data).mean(axis=(1, 2, 3))
-        losses.append(np.where(fit.finite, loss, np.inf))
-        advance(len(chunk))
-    return BatchRefinement(refined, np.concatenate(finished), np.concatenate(losses))
-
-
-def smooth_batch(
-    models: Sequence[SparseModel],
-    batch: WindowBatch,
-    *,
-    method: Method,
-    points_per_batch: int = 8,
-    advance: Advance = nothing,
-) -> Float[np.ndarray, "models windows samples n_states"]:
-    """Trajectories that follow the windows best, with starts fitted and coefficients fixed.
-
-    They are in units of the batch's scale; NaN in windows where a model blows up.
-    points_per_batch: as for `refine`, where models may also differ in their terms. advance:
-    called with the number of models finished.
-    Raises ValueError for a model without terms.
-    """
-    windows = batch.split()
-    paths = []
-    for some in _chunks(len(models), points_per_batch):
-        chunk = models[some]
-        by_model = RefinementProblem.of(
-            chunk, [batch] * len(chunk), [all_fixed(model) for model in chunk]
-        )
-        # Every window is a separate point, so one that blows up does not stop the others.
-        problem = replace(
-            by_model,
-            equations=tuple(each for each in by_model.equations for _ in windows),
-            batches=tuple(windows * len(chunk)),
-        )
-        paths.append(follow_windows(problem, method.fit(problem)))
-        advance(len(chunk))
-    return np.concatenate(paths).reshape(len(models), *batch.data.shape)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -56,14 +56,6 @@ class WindowBatch:
         apart = np.diff(self.trajectory[order]) != 0
         covered = window + np.where(apart, window, np.minimum(gaps, window)).sum()
         return float(window * len(order) / covered)
-
-    def split(self) -> list[WindowBatch]:
-        """Split into batches of one window each, in the same scale."""
-        names = ("steps", "data", "inputs", "trajectory", "start")  # with an entry per window
-        return [
-            replace(self, **{name: getattr(self, name)[[w]] for name in names})
-            for w in range(len(self.start))
-        ]
 
 
 def cut_windows(

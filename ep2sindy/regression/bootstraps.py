@@ -242,11 +242,7 @@ def draw_resamples(
 
 
 def pool_supports(
-    problem: RegressionRows,
-    search: Search,
-    bootstraps: Bootstraps,
-    *,
-    rng: np.random.Generator,
+    problem: RegressionRows, search: Search, bootstraps: Bootstraps, *, rng: np.random.Generator
 ) -> tuple[Supports, ...]:
     """Search every bootstrap of the training rows, and return one `Supports` per equation."""
     draws = draw_resamples(problem, bootstraps, rng=rng)

@@ -11,19 +11,18 @@ from jaxtyping import Float
 
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.model.model import SparseModel
-from ep2sindy.refinement.refine import BatchRefinement, smooth_batch
-from ep2sindy.refinement.windows import MIN_SAMPLES, WindowBatch, dominant_window
-from ep2sindy.runtime.progress import SILENT, Progress
+from ep2sindy.model.restarts import Restarts
+from ep2sindy.refinement.windows import MIN_SAMPLES, dominant_window
+from ep2sindy.runtime.progress import Progress
 from ep2sindy.selection.criteria import FLOOR, MAX_ERROR
 from ep2sindy.selection.systems import (
+    BatchRefinement,
     ConfirmedSystem,
     Fold,
     Segment,
     Trial,
     TrialSystem,
-    cut_segments,
     deal,
-    plan_refinement,
 )
 
 # Fewest pairs of windows to cut the records into.
@@ -37,18 +36,18 @@ N_ERRORS = 2.0
 class WindowsLeftOut:
     """Errors of systems on windows that share no samples with those that they were refined on.
 
-    To assess a system, its coefficients are held and each window's start is fitted: from a smoothed
-    start even the true system, if it is chaotic, runs away from its own samples. The error is the
-    mean square distance to the samples in variances of each state, averaged over the states with
-    weights 1 / residual of the leader, the system of greatest likelihood. It is at most 10, which
-    also stands for a window that a system cannot run through. A refinement that blows up, or that
-    does not converge and follows its own windows no better, keeps the coefficients of the
-    regression, which are assessed like any other. Its bound is two standard errors above the
-    leader's. The standard error is that of the difference between the two errors, in which noise
-    that both meet cancels: with n independent residuals an excess fraction of q in the error has
-    the standard error sqrt(4 q / n), so q = 16 / n is two of them. n is the number of residuals
-    times (1 - rho) / (1 + rho), rho being the autocorrelation of the leader's residuals from sample
-    to sample. So differences between models that miss more than white noise are uncertain.
+    To assess a system, its coefficients are held and each window's start is fitted
+    (`model.restarts`): from a smoothed start even the true system, if it is chaotic, runs away from
+    its own samples. The error is the mean square distance to the samples in variances of each
+    state, averaged over the states with weights 1 / residual of the leader, the system of greatest
+    likelihood. It is at most 10, which also stands for a window that a system cannot run through. A
+    refinement that blows up keeps the coefficients of the regression, which are assessed like any
+    other. The bound of the error is two standard errors above the leader's. The standard error is
+    that of the difference between the two errors, in which noise that both meet cancels: with n
+    independent residuals an excess fraction of q in the error has the standard error sqrt(4 q / n),
+    so q = 16 / n is two of them. n is the number of residuals times (1 - rho) / (1 + rho), rho
+    being the autocorrelation of the leader's residuals from sample to sample. So differences
+    between models that miss more than white noise are uncertain.
 
     runs: the records between their gaps. spread: standard deviation of each state over all runs.
     n_windows: that are assessed, over all records, each in one fold.
@@ -100,23 +99,22 @@ class WindowsLeftOut:
         self,
         systems: Sequence[TrialSystem],
         refined: BatchRefinement,
-        fitted: WindowBatch,
         fold: Fold,
         progress: Progress,
     ) -> Float[np.ndarray, "systems windows samples n_states"]:
-        """Distances to windows held out, in standard deviations of the states."""
-        models, before = list(refined.models), [system.model for system in systems]
-        doubtful = np.flatnonzero(~refined.finished)
-        worse, better = (
-            _bounded_squares(_residuals([each[k] for k in doubtful], fitted)).mean(axis=(1, 2))
-            for each in (models, before)
-        )
-        for k in doubtful[worse >= better]:
-            models[k] = before[k]
-        held = cut_segments(
-            self.runs, fold.held, before[0], window=self.window, n_windows=self.count(fold.held)
-        )
-        return _residuals(models, held, progress) * (held.scale[: len(self.spread)] / self.spread)
+        """Distances to windows held out, in `spread`; NaN once a run has diverged."""
+        number, first = np.array([(window.run, window.start) for window in fold.held]).T
+        found = np.empty((len(systems), len(first), self.window, len(self.states)))
+        with progress.stage(len(systems), "system", "starts of windows held out") as advance:
+            for model, distances in zip(refined.models, found, strict=True):
+                for k in np.unique(number).tolist():
+                    along, own = Restarts(model, self.runs[k]), number == k
+                    starts = along.fitted(first[own], self.window - 1)
+                    paths = along.paths(starts, first[own], self.window - 1)
+                    samples = along.samples[first[own, None] + np.arange(self.window)]
+                    distances[own] = (paths - samples) / self.spread
+                advance(1)
+        return found
 
     def figures(self, tried: Sequence[np.ndarray]) -> Float[np.ndarray, "systems 5"]:
         """Errors in units of their bound, zero up to the bound, as those systems are alike."""
@@ -129,20 +127,6 @@ class WindowsLeftOut:
         """A system is confirmed if its coefficients, refined on all data, meet the demands."""
         broken = trial.system.broken(model)
         return ConfirmedSystem(trial, model, broken, fraction=float(not broken))
-
-
-def _residuals(
-    models: Sequence[SparseModel], batch: WindowBatch, progress: Progress = SILENT
-) -> Float[np.ndarray, "models windows samples n_states"]:
-    """Distances of the best trajectories to the samples, in the batch's scale; NaN if none."""
-    if not models:
-        return np.empty((0, *batch.data.shape))
-    method, together = plan_refinement(batch, models[0].library)
-    with progress.stage(len(models), "system", "starts of windows held out") as advance:
-        return (
-            smooth_batch(models, batch, method=method, points_per_batch=together, advance=advance)
-            - batch.data
-        )
 
 
 def _errors_and_bound(

@@ -27,14 +27,14 @@ from ep2sindy.model.many import WindowSteps, run_many
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.stability import ATTRACTING_BELOW, LEAST_WAIT, REPELLING_ABOVE, basin_stability
 from ep2sindy.model.vector_field import VectorField
-from ep2sindy.refinement.refine import BatchRefinement
-from ep2sindy.refinement.windows import MIN_SAMPLES, WindowBatch
+from ep2sindy.refinement.windows import MIN_SAMPLES
 from ep2sindy.regression.front import Fronts
 from ep2sindy.runtime.progress import SILENT, Progress, count_pieces
 from ep2sindy.runtime.values import check_kind, check_list, set_counts
 from ep2sindy.selection.by_windows import WindowsLeftOut
 from ep2sindy.selection.criteria import MAX_ERROR, Basis, Decision
 from ep2sindy.selection.systems import (
+    BatchRefinement,
     ConfirmedSystem,
     Fold,
     Segment,
@@ -257,8 +257,10 @@ class FreeRunScore:
                 measure.runs, fold.fitted, tried[0].model, window=measure.window,
                 n_windows=measure.count(fold.fitted), seed=self.seed,
             )  # fmt: skip
-            refined = refine_systems(tried, fitted, progress, n_reweights=measure.n_reweights)
-            found.append(measure.assess(tried, refined, fitted, fold, progress))
+            refined = refine_systems(
+                tried, fitted, n_reweights=measure.n_reweights, progress=progress
+            )
+            found.append(measure.assess(tried, refined, fold, progress))
         for k, figures in zip(some, measure.figures(found), strict=True):
             trials[k] = Trial(systems[k], *figures.tolist())
         return trials
@@ -329,7 +331,6 @@ class CycleRuns:
         self,
         systems: Sequence[TrialSystem],
         refined: BatchRefinement,
-        fitted: WindowBatch,
         fold: Fold,
         progress: Progress,
     ) -> Float[np.ndarray, "systems 5"]:

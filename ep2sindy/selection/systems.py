@@ -12,17 +12,17 @@ from jaxtyping import Float, Int
 from ep2sindy.data.coerce import DiscoveryProblem
 from ep2sindy.data.trajectory import Trajectory
 from ep2sindy.forecasting.evaluation import Evaluation
-from ep2sindy.library.library import Library
 from ep2sindy.library.relations import Constraint, Process, binding, constraint
 from ep2sindy.library.roles import process_amounts
 from ep2sindy.model.model import SparseModel, model_of
 from ep2sindy.refinement.methods.multiple_shooting import MultipleShooting
-from ep2sindy.refinement.problem import RefinementChanges
-from ep2sindy.refinement.refine import BatchRefinement, refine, refine_batch
+from ep2sindy.refinement.problem import RefinementChanges, RefinementProblem
+from ep2sindy.refinement.refine import refine, with_coef
 from ep2sindy.refinement.steps import fastest_step
 from ep2sindy.refinement.windows import MIN_SAMPLES, WindowBatch, cut_windows
 from ep2sindy.regression.front import Fronts
-from ep2sindy.runtime.progress import Progress
+from ep2sindy.runtime.progress import SILENT, Progress
+from ep2sindy.runtime.threads import one_thread
 from ep2sindy.selection.criteria import (
     FLOOR,
     MAX_ERROR,
@@ -254,33 +254,51 @@ def cut_segments(
     return cut_windows(pieces, model, n_windows=n_windows, window=length, rng=seed)
 
 
-def plan_refinement(batch: WindowBatch, library: Library) -> tuple[MultipleShooting, int]:
-    """Refinement method for systems to be assessed, and how many to refine together.
+@dataclass(frozen=True, eq=False)
+class BatchRefinement:
+    """Models of systems that were refined on the same windows, without assessment.
+
+    loss: mean square of (trajectory - data) in the batch's scale. If a refinement did not stay
+    finite, the loss is infinite and the model is that of the system.
+    """
+
+    models: Sequence[SparseModel]
+    loss: Float[np.ndarray, " systems"]
+
+
+@one_thread()
+def refine_systems(
+    systems: Sequence[TrialSystem],
+    batch: WindowBatch,
+    *,
+    n_reweights: int = 1,
+    progress: Progress = SILENT,
+) -> BatchRefinement:
+    """Every system refined on the same windows. Raises ValueError for one without terms.
 
     The regression's coefficients are close, so whole windows are fitted at once in few iterations.
     Systems that need more are the wrong ones.
     """
-    method = MultipleShooting(
-        step=fastest_step(library), first_memory=batch.data.shape[1], tolerance=1e-3, max_iter=10
-    )
-    return method, max(1, BATCH_STEPS // batch.steps.size)
-
-
-def refine_systems(
-    systems: Sequence[TrialSystem], batch: WindowBatch, progress: Progress, *, n_reweights: int
-) -> BatchRefinement:
-    """Every system refined on the same windows. Raises ValueError for one without terms."""
-    method, together = plan_refinement(batch, systems[0].model.library)
+    step, n_samples = fastest_step(systems[0].model.library), batch.data.shape[1]
+    method = MultipleShooting(step=step, first_memory=n_samples, tolerance=1e-3, max_iter=10)
+    together = max(1, BATCH_STEPS // batch.steps.size)
+    models, losses = [], []
     with progress.stage(len(systems), "system", "refined without a fold") as advance:
-        return refine_batch(
-            [system.model for system in systems],
-            batch,
-            method=method,
-            constraints=[system.constraint for system in systems],
-            n_reweights=n_reweights,
-            points_per_batch=together,
-            advance=advance,
-        )
+        for k in range(0, len(systems), together):
+            some = systems[k : k + together]
+            own, relations = [s.model for s in some], [s.constraint for s in some]
+            batches = [batch] * len(own)
+            problem = RefinementProblem.of(own, batches, relations, n_reweights=n_reweights)
+            fit = method.fit(problem)
+            with np.errstate(over="ignore", invalid="ignore"):
+                loss = np.square(fit.nodes - problem.data).mean(axis=(1, 2, 3))
+            losses.append(np.where(fit.finite, loss, np.inf))
+            for p, (model, equations) in enumerate(zip(own, problem.equations, strict=True)):
+                values = equations.coef(fit.scaling[p, : equations.n_free])
+                moved, _ = with_coef(model, equations.relations, values)
+                models.append(moved if fit.finite[p] else model)
+            advance(len(own))
+    return BatchRefinement(models, np.concatenate(losses))
 
 
 @dataclass(frozen=True, eq=False)
