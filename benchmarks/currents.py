@@ -42,7 +42,7 @@ def write_currents(folder: Path, noise: float) -> None:
 def measure(folder: Path) -> str:
     """What the program finds in the files of a folder."""
     run = subprocess.run(
-        [sys.executable, "-m", "experiments.run", "+exp=predict", "models=null", "data=recognised",
+        [sys.executable, "-m", "experiments.run", "+exp=predict", "data=recognised",
          f"points.files='{folder}/V={{V_D_V}}_m={{mdot_mg_s}}.csv'", "trajectory.states=[I]",
          f"output={folder}", "map_points=null"],
         capture_output=True, text=True, check=False,
