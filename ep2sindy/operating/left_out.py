@@ -81,8 +81,9 @@ class LeftOutRun:
             self.amplitude_error / bounds.amplitude,
             self.waveform_error / bounds.waveform,
         )
-        known = np.isfinite(errors).all() and run.multiplier < ATTRACTING_BELOW
-        return min(max(errors), WORST) if known else WORST
+        if not np.isfinite(errors).all() or not (run.multiplier < ATTRACTING_BELOW or run.holds):
+            return WORST
+        return min(max(errors), WORST)
 
 
 @dataclass(frozen=True, eq=False)
