@@ -6,6 +6,7 @@ import pytest
 import xarray as xr
 from omegaconf import DictConfig
 
+import ep2sindy as ep
 from benchmarks import known_laws
 from ep2sindy.app import runner
 from ep2sindy.app.runner import run_config
@@ -261,3 +262,40 @@ def test_the_law_of_known_records_is_headlined(
             for term, value in true.terms(state).items()
         ]
     assert np.sqrt(np.square(missed).mean()) < 0.01
+
+
+def test_breathing_over_points_is_this_study(tmp_path: Path) -> None:
+    """Of files with foreign names; the inflow is stated as a function of the point."""
+    values = (0.95, 0.96, 0.97, 0.98)
+    for a in values:
+        run = breathing_at(a)
+        table = run.to_dataframe().set_axis(["<ne> [m^-3]", "<nn> [m^-3]"], axis=1)
+        table.to_csv(tmp_path / f"a{a}.csv", index_label="t [s]")
+    found = programs.computed(
+        programs.composed(
+            "+exp=breathing", "data=recognised", "data.path=null",
+            f"points.files='{tmp_path}/a{{a}}.csv'", "sustained.roles.inflow.n_n={a: 1.0e18}",
+            "sustained.search={max_terms: 4, n_best: 100}", "sustained.depth=2",
+            "parallel=serial", f"output={tmp_path}",
+        )
+    )  # fmt: skip
+    law = OperatingLaw.load(found.folder / "law.json")
+    assert found.report.headline["n_fitted_sustained"] == 4
+    assert law.at(a=0.965).terms("n_n")["1"] == pytest.approx(0.965e18)
+    processes = found.report.tables["processes"]
+    assert set(processes["a"]) == {*values}
+    supplied = processes[processes["process"] == "neutrals that enter"]
+    np.testing.assert_allclose(supplied["modelled"], 1e18 * supplied["a"])
+    found.check_figures("laws", "map", "processes")
+
+
+def breathing_at(a: float) -> ep.Trajectory:
+    """Ions that leave, ionization that rises with them, and an inflow in proportion to a."""
+    library, size = ep.polynomial(["n_i", "n_n"], degree=3), 1e18
+    born = {"n_i^2*n_n": 1.0 / size**2}
+    lost = {"n_n": -0.02, "n_i^2*n_n": -1.0 / size**2}
+    coef = ep.model.coef_matrix(library, [{"n_i": -1.0, **born}, {"1": size * a, **lost}])
+    model = ep.SparseModel(library, ["n_i", "n_n"], coef, {"n_i": "m^-3", "n_n": "m^-3"})
+    t = 0.1 * np.arange(4000)
+    states = model.simulate(t, [0.9 * size, size]).states
+    return ep.Trajectory(t, states, ["n_i", "n_n"], units=model.units).window(2000, 4000)
