@@ -50,7 +50,7 @@ def test_an_interpolation_does_not_extrapolate() -> None:
 
 def test_errors_of_an_interpolation_are_those_of_points_left_out() -> None:
     points = np.array([[*record.parameters.values()] for record in records()])
-    found = Interpolation.of(LINEAR, points, records())
+    found = Interpolation.of(LINEAR, records(), ["x", "y"])
     assert found.states == ("x", "y")
     k, own = 4, found.cycles
     values = LINEAR.evaluate(points)

@@ -7,8 +7,8 @@ import pytest
 
 import ep2sindy as ep
 from ep2sindy.library.facts import Known
-from ep2sindy.operating.law import LawConstraint, constrain_law, law_of_constraint
-from ep2sindy.operating.left_out import LawTrial, run_left_out
+from ep2sindy.operating.law import LawConstraint, constrain_law
+from ep2sindy.operating.left_out import LawTrial
 from ep2sindy.operating.point_fits import PointFits, fit_rows, fit_trajectories
 from ep2sindy.operating.records import OperatingRecord
 from tests.test_operating_law import GRID, LIBRARY, LINEAR, SHORT, STATES, STRUCTURE
@@ -60,7 +60,7 @@ def by_rows(relations: LawConstraint) -> PointFits:
 def fits() -> dict[str, PointFits]:
     """By rows, and refined."""
     rows, runs = by_rows(held()), [[record.run] for record in records()]
-    return {"rows": rows, "trajectories": fit_trajectories(rows, runs, SHORT)}
+    return {"rows": rows, "trajectories": fit_trajectories([rows], runs, SHORT)[0]}
 
 
 @cache
@@ -81,6 +81,8 @@ def test_relations_and_known_values_are_exact_in_every_fit_and_law(how: str) -> 
     fit = fits()[how]
     for record, model in zip(records(), fit.models, strict=True):
         check_exact(model, record.parameters["a"])
+    own = fit.relations.at(np.array([[0.5, 0.0], [1.0, 0.0], [1.5, 0.0]]))
+    assert [each.d[0] for each in own] == pytest.approx([0.75, 0.9, 1.15])
     assert fit.n_free == 2
     assert fit.coefficients.shape == (9, 2)
     assert fit.information.shape == (9, 2, 2)
@@ -114,8 +116,8 @@ def test_a_known_number_has_no_interval_and_a_shared_one_has_the_same_twice() ->
 
 @BOTH
 def test_points_left_out_live_by_laws_under_relations(how: str) -> None:
-    found = run_left_out(LawTrial(how, fits()[how], LINEAR, np.zeros(9)), records())
-    assert all(each.run.holds for each in found)
+    found = LawTrial(how, fits()[how], LINEAR, records())
+    assert all(each.run.holds for each in found.left_out)
 
 
 def test_a_file_holds_the_relations() -> None:
@@ -146,13 +148,3 @@ def test_relations_that_cannot_hold_are_refused(
 ) -> None:
     with pytest.raises(ValueError, match=message):
         held(relations, known).at(np.array([list(point.values()) for point in GRID]))
-
-
-def test_a_constraint_of_one_point_holds_at_all_of_them() -> None:
-    one = ep.library.constraint(LIBRARY, STRUCTURE, ["x: x^3 == -0.3", *RELATIONS])
-    relations = law_of_constraint(one, ["a", "b"])
-    for each in relations.at(np.array([[0.5, 0.0], [1.0, 2.0]])):
-        np.testing.assert_array_equal(each.C, one.C)
-        np.testing.assert_array_equal(each.d, one.d)
-    own = held().at(np.array([[0.5, 0.0], [1.0, 0.0], [1.5, 0.0]]))
-    assert [each.d[0] for each in own] == pytest.approx([0.75, 0.9, 1.15])

@@ -1,6 +1,7 @@
 # Discover
 from ep2sindy.discovery.pointwise import PointSearch as PointSearch
 from ep2sindy.discovery.estimator import SINDy as SINDy
+from ep2sindy.discovery.several_points import LawSearch as LawSearch
 from ep2sindy.estimation.cost import SlowSearch as SlowSearch
 
 # Selection

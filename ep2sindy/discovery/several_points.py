@@ -86,7 +86,7 @@ class LawSearch:
     Examples
     --------
     >>> windows = ep.refinement.RefinementSettings(n_windows=20, periods=4.0)
-    >>> ep.operating.LawSearch(1, windows).functions
+    >>> ep.discovery.LawSearch(1, windows).functions
     1
     """
 
@@ -110,7 +110,7 @@ def discover_together(
     If no law holds at most of its records and these are on two cycles, it is that of the cycle that
     most are on. given: the runs of each point, by its label.
     """
-    quiet = [] if law is None else quiet_points(given.values(), asked.states)
+    quiet = [] if law is None or asked.hidden else quiet_points(given.values(), asked.states)
     aside = {point_label(point.parameters) for point in quiet}
     records = {k: OperatingRecord(runs[0]) for k, runs in given.items() if k not in aside}
     repeat = bool(records) and all(record.repeats for record in records.values())

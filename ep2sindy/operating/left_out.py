@@ -377,7 +377,8 @@ def choose_law(trials: Sequence[LawTrial]) -> LawChoice:
         place = fewest_of_least([(trial.errors, trial.n_numbers) for trial in tested])
         return LawChoice(trials, tested[place], [], between)
     most = max(trial.held for trial in tested)
-    best = min((t for t in tested if t.held == most), key=lambda t: (t.score, t.error))
+    held = [trial for trial in tested if trial.held == most]
+    best = min(held, key=lambda t: (t.score, max(t.error, ACCURATE), t.n_numbers))
     return LawChoice(trials, best, _beside(best.left_out, between), between)
 
 
