@@ -9,8 +9,10 @@ import pytest
 
 import ep2sindy as ep
 from ep2sindy.operating.law import OperatingLaw, constrain_law
+from ep2sindy.operating.left_out import LawTrial, choose_law
 from ep2sindy.operating.point_fits import PointFits, fit_rows
 from ep2sindy.operating.quiet import QuietPoint, RestingModel, quiet_points
+from ep2sindy.operating.records import OperatingRecord
 from tests.models import plain_rows
 
 STATES, TURN = ("x", "v"), 2.0 * np.pi
@@ -60,7 +62,9 @@ def records(true: Callable[[float], ep.SparseModel]) -> dict[float, ep.Trajector
 
 
 def fitted(
-    true: Callable[[float], ep.SparseModel], points: Mapping[float, np.ndarray]
+    true: Callable[[float], ep.SparseModel],
+    points: Mapping[float, np.ndarray],
+    relations: Sequence[str] = (),
 ) -> PointFits:
     """Fits to samples at every point, with the true rates there."""
     problems = []
@@ -73,8 +77,8 @@ def fitted(
         )
         problems.append([replace(rows, trajectories=(run,))])
     terms = {state: list(model.terms(state)) for state in names}
-    relations = constrain_law(model.library, terms, parameters=["P"])
-    return fit_rows(["P"], np.array([*points])[:, None], problems, relations, provenance={})
+    held = constrain_law(model.library.relate(*relations), terms, parameters=["P"])
+    return fit_rows(["P"], np.array([*points])[:, None], problems, held, provenance={})
 
 
 @cache
@@ -132,6 +136,21 @@ def test_a_law_that_is_quiet_already_is_unchanged() -> None:
     plain = pooled(fits(straight), [])
     assert [growth(plain, P) for P in SILENT] == pytest.approx([-0.15, -0.06], abs=1e-6)
     np.testing.assert_array_equal(pooled(fits(straight), quiet).coef, plain.coef)
+
+
+def test_a_law_that_cannot_rest_is_not_chosen() -> None:
+    """Its growth is known to be the same everywhere."""
+    own = {P: settled(straight(P), 2.0) for P in LOUD}
+    loud = [OperatingRecord(records(straight)[P]) for P in LOUD]
+    never, free = (
+        LawTrial("", replace(each, quiet=silent(straight)), LINE, loud, None, np.full(5, error))
+        for each, error in ((fitted(straight, own, ["v: v == 0.5"]), 0.1), (fits(straight), 0.2))
+    )
+    assert (never.rests, free.rests) == ([False] * 2, [True] * 2)
+    assert free.score < 1.0 < never.score
+    found = choose_law([never, free])
+    assert found.choice is free
+    assert found.quiet == {"P=1": True, "P=1.6": True}
 
 
 FLOW = ep.named_terms(["x", "y"], ["1", "x", "x^2*y"])

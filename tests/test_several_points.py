@@ -11,9 +11,13 @@ import pytest
 import ep2sindy as ep
 from benchmarks import known_laws
 from benchmarks.points import LIBRARY, PARAMETERS, TRUTH, realization, system_at
+from ep2sindy.discovery import several_points
+from ep2sindy.operating.records import OperatingRecord, branches_of
 from ep2sindy.regression.rows import Formulation, RegressionRows
 from ep2sindy.selection.criteria import Selection, log_supports
-from tests.models import plain_rows
+from tests.models import lienard, plain_rows
+from tests.test_operating_law import LIBRARY as OSCILLATOR
+from tests.test_operating_law import STRUCTURE, recorded
 
 METHOD = ep.Regression(
     ep.WeightedWeak(
@@ -489,6 +493,77 @@ def test_every_number_of_a_discovery_of_points_survives_a_file() -> None:
     for own, other in zip(again.points.values(), found.points.values(), strict=True):
         assert own.model == other.model
     assert repr(again) == repr(found)
+
+
+def lienards(scale: Mapping[tuple[float, ...], float], *names: str) -> list[ep.Trajectory]:
+    """One record at every point (parameters), of cycles that are larger by a factor."""
+    run = recorded(1.0, 0.0).run
+    return [
+        replace(run, states=run.states * each, parameters=dict(zip(names, point, strict=True)))
+        for point, each in scale.items()
+    ]
+
+
+LIENARD = OSCILLATOR.only(STRUCTURE)
+
+
+def test_where_no_law_holds_the_records_are_interpolated() -> None:
+    """Everything is faster by half between the second point and the third."""
+    runs = lienards({(1.0,): 1.0, (2.0,): 1.01, (3.0,): 1.02, (4.0,): 1.03}, "a")
+    runs[2:] = [replace(run, t=run.t / 1.5) for run in runs[2:]]
+    choice = ep.discover(runs, LIENARD, ep.Regression(), law=1).law_choice
+    assert choice.heading == "interpolate: the law holds at 0 of 2 points left out"
+    assert "take it, and not the law" in choice.text
+    assert not choice.is_trusted
+    cycle = choice.interpolation.at(a=2.5)
+    slow = OperatingRecord(runs[0]).cycle.frequency_Hz
+    assert slow < cycle.frequency_Hz[0] < 1.5 * slow
+    assert {*cycle.amplitude} == {"x", "y"}
+
+
+def test_a_second_cycle_is_set_aside_only_if_no_law_holds_at_both() -> None:
+    places = {(0.5,): 1.0, (0.7,): 1.01, (0.9,): 1.02, (1.1,): 0.2, (1.3,): 1.03, (1.5,): 1.04,
+              (1.7,): 1.05}  # fmt: skip
+    found = ep.discover(lienards(places, "a"), LIENARD, ep.Regression(), law=1)
+    assert [*found.points] == [f"a={a}" for (a,) in places if a != 1.1]
+    assert len(found.law.points) == 6
+    assert found.law_choice.cycle == "strong"
+    (warning,) = found.data_warnings
+    assert "of the 6 points on the strong one; on the other are a=1.1" in warning
+    # The factor of x^3 is 1 + 24 a b, so that the amplitude is a fifth at the last point.
+    points = [(0.0, 0.0), (0.5, 0.0), (1.0, 0.0), (0.0, 0.5), (0.0, 1.0), (1.0, 0.04), (1.0, 1.0)]
+    runs = lienards(
+        {(a, b): (1.0 + 1e-3 * k) / np.sqrt(1.0 + 24.0 * a * b) for k, (a, b) in enumerate(points)},
+        "a", "b",
+    )  # fmt: skip
+    assert branches_of([OperatingRecord(run) for run in runs]).tolist() == [0] * 6 + [1]
+    both = ep.named_terms(["a", "b"], ["1", "a*b"])
+    found = ep.discover(runs, LIENARD, ep.Regression(), law=both)
+    assert (len(found.points), found.law_choice.cycle, found.data_warnings) == (7, "all", ())
+
+
+def test_a_law_of_one_signal_is_judged_by_it_and_follows_long_windows(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    signals, windows, refine = [], [], several_points.fit_trajectories
+    for k, a in enumerate((0.9, 1.0, 1.1, 1.2)):
+        run = lienard(a)
+        x = run.states[:, :1] + 0.005 * np.random.default_rng(k).normal(size=(run.n_samples, 1))
+        signal = ep.Trajectory(run.t, x, ["p"], parameters={"a": a})
+        signals.append(ep.signals.prepare_signal(signal))
+
+    def recorded(*given: object, **settings: object) -> object:
+        windows.append(given[2].periods)
+        return refine(*given, **settings)
+
+    monkeypatch.setattr(several_points, "fit_trajectories", recorded)
+    made = ep.signals.embed_alike(signals)
+    library = made[0].library(degree=3).only({"v": ["p", "v", "p^2*v"]})
+    choice = ep.discover([each.run for each in made], library, law="auto").law_choice
+    assert windows == [8.0]
+    assert choice.choice.assessed == ["p"]
+    assert {(*point.run.assessed,) for point in choice.runs} == {(0,)}
+    assert choice.is_trusted
 
 
 UNLIKE = "runs of several operating points need the same parameters"

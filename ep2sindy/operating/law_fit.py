@@ -119,7 +119,8 @@ def _linearise(
     starts = along.fitted(first, n_ahead) if near is None else along.nearer(first, n_ahead, near)
 
     def off(of: Restarts, moved: Float[np.ndarray, "windows n_states"]) -> np.ndarray:
-        return of.off(of.paths(moved, first, n_ahead), first).reshape(len(first), -1)
+        found = of.off(of.paths(moved, first, n_ahead), first).reshape(len(first), -1)
+        return np.where(np.isfinite(found), found, np.nan)
 
     left = off(along, starts)
     by_start = [(off(along, starts + MOVED * row) - left) / MOVED for row in np.diag(along.std)]
