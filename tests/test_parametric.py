@@ -29,13 +29,9 @@ SHARED = "x: x*y*R == -1 * y: x*y*R"
 UNITS = {"x": "m^-3", "y": "m^-3", "R": "m^3/s", "u": "m/s"}
 LENGTH, INJECTED = Quantity("x: x*u", -1.0, -1), Quantity("y: 1")
 PARAMETERS = ("V", "m")
+SHARES = {"eps_x": Quantity("x: x*y*R"), "eps_y": Quantity("y: x*y*R", -1.0)}
 QUANTITIES = {
-    "free": {
-        "L": LENGTH,
-        "g": INJECTED,
-        "eps_x": Quantity("x: x*y*R"),
-        "eps_y": Quantity("y: x*y*R", -1.0),
-    },
+    "free": {"L": LENGTH, "g": INJECTED} | SHARES,
     "constrained": {"L": LENGTH, "g": INJECTED, "eps": Quantity("x: x*y*R")},
 }
 RELATIONS = {

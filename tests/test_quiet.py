@@ -117,7 +117,7 @@ def test_a_law_rests_where_the_record_does_and_keeps_its_cycles(
 
 
 def test_laws_without_a_point_rest_as_well() -> None:
-    """By these are the errors at points left out, and the covariance."""
+    """By these are the errors at points left out."""
     fits_of = replace(fits(tube), quiet=silent(tube))
     laws = [fits_of.law_without(k, LINE) for k in range(len(LOUD))]
     assert max(growth(law, P) for law in laws for P in SILENT) < -0.0098
@@ -125,9 +125,6 @@ def test_laws_without_a_point_rest_as_well() -> None:
     for k, (law, error) in enumerate(zip(laws, found.left_out, strict=True)):
         off, weight = law.coef @ [1.0, LOUD[k]] - own[k], fits_of.information[k]
         assert error == pytest.approx(np.sqrt(off @ weight @ off / (own[k] @ weight @ own[k])))
-    coef = np.array([law.coef for law in laws]).reshape(len(laws), -1)
-    apart = coef - coef.mean(axis=0)
-    np.testing.assert_allclose(found.covariance, 0.8 * apart.T @ apart, rtol=1e-9, atol=1e-15)
 
 
 def test_a_law_that_is_quiet_already_is_unchanged() -> None:
@@ -231,27 +228,18 @@ def sample(kind: str) -> np.ndarray:
     }[kind]
 
 
-@pytest.mark.parametrize(
-    ("kind", "is_quiet"),
-    [
-        ("loud", False),
-        ("small cycle", False),
-        ("offset", False),
-        ("offset in noise", False),
-        ("white", True),
-        ("steady", True),
-        ("decaying", True),
-        ("driven", True),
-    ],
-)
-def test_quiet_records_are_told_from_small_cycles(kind: str, is_quiet: bool) -> None:
+RESTS = ("white", "steady", "decaying", "driven")
+
+
+@pytest.mark.parametrize("kind", ["loud", "small cycle", "offset", "offset in noise", *RESTS])
+def test_quiet_records_are_told_from_small_cycles(kind: str) -> None:
     def run(name: str, P: float) -> ep.Trajectory:
         states = sample(name)
         t = 0.02 * np.arange(len(states))
         return ep.Trajectory(t, states, STATES, parameters={"P": P})
 
     found = quiet_points([[run("loud", 1.0)], [run(kind, 2.0)]], STATES)
-    assert [point.parameters["P"] for point in found] == ([2.0] if is_quiet else [])
+    assert [point.parameters["P"] for point in found] == ([2.0] if kind in RESTS else [])
     if found:
         (point,) = found
         np.testing.assert_allclose(point.scale, np.array([1.0, TURN]) / np.sqrt(2.0), rtol=0.02)
