@@ -12,12 +12,7 @@ from scipy.signal import lfilter
 import ep2sindy as ep
 from ep2sindy.operating.law import constrain_law
 from ep2sindy.operating.point_fits import FAILED, PointFits, fit_rows, fit_trajectories
-from ep2sindy.operating.quantities import (
-    Quantity,
-    control_functions,
-    estimate_quantities,
-    lines_of,
-)
+from ep2sindy.operating.quantities import Quantity, control_functions, estimate_quantities, lines_of
 from ep2sindy.regression.constrained import solve_constrained
 from ep2sindy.regression.rows import RegressionRows
 from ep2sindy.signals.spectrum import oscillation
@@ -81,8 +76,7 @@ def runs() -> list[ep.Trajectory]:
     sampling = zip(TRUTHS, (0.01, 0.013, 0.008), (20, 25, 15), strict=True)
     return [
         replace(
-            forced(**truth, dt=dt, periods=periods),
-            parameters={"V": 100.0 * (k + 1), "m": 2.0**k},
+            forced(**truth, dt=dt, periods=periods), parameters={"V": 100.0 * (k + 1), "m": 2.0**k}
         )
         for k, (truth, dt, periods) in enumerate(sampling)
     ]
