@@ -9,9 +9,8 @@ known law, with records of about one pulse. Percentage of realizations in which 
 equations are right: of one search over all points, of one regression with shared coefficients, and
 of every point alone; then the errors of the coefficients.
 `grid`: the package's own discharge at 290 to 370 V and 4 to 5.5 mg/s, five by five, 6 ms each,
-densities averaged over the channel. Every point is left out in turn of quadratic laws, for the
-models of conf/exp/predict.yaml and some next to them, and next to interpolation without a model;
-then the law of the study's choice at points drawn between.
+densities averaged over the channel. The laws of three given structures, and of one that is searched
+under roles: each point left out in turn, next to interpolation without a model, and points between.
 """
 
 from __future__ import annotations
@@ -20,26 +19,11 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import product
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
-import yaml
 
 import ep2sindy as ep
-from ep2sindy.forecasting.evaluation import Evaluation
-from ep2sindy.operating.given_models import (
-    REFINED,
-    FittingSettings,
-    GivenModel,
-    PointResult,
-    fit_models,
-    fits_of,
-)
-from ep2sindy.operating.law import constrain_law
-from ep2sindy.operating.left_out import LawTrial, error_statistics, run_left_out
-from ep2sindy.operating.records import OperatingRecord, read_points
 from ep2sindy.runtime.parallel import Loky, Workers
 
 # The thesis's six operating points (Table IV): V and mg/s.
@@ -148,18 +132,32 @@ def family(n_realizations: int) -> None:
     print(rows.groupby("noise")[list(ERRORS)].median())
 
 
-CONFIG = Path(__file__).parents[1] / "conf" / "exp" / "predict.yaml"
-MODELS: dict[str, Any] = yaml.safe_load(CONFIG.read_text("utf-8"))["models"]
-CHOICE = "leaving"
-MODELS["leaving, all free"] = {"terms": MODELS[CHOICE]["terms"]}
 STATES, NAMES = ["n_i", "n_n"], ["V_D_V", "mdot_mg_s"]
 CUBIC = ep.polynomial(STATES, degree=3)
-QUADRATIC = ep.polynomial(NAMES, degree=2)
+INFLOW = {"mdot_mg_s": 4.58e22}  # mdot / (m_Xe A L) with A = 40.06 cm^2 and L = 25 mm
+FED = CUBIC.known({"n_n": {"1": INFLOW}})
+LEAVING = {f"n_i: {term} == -1 * n_n: {term}" for term in ("n_i*n_n", "n_i^2*n_n")}
+EXCHANGED = {
+    "n_i": ["n_i", "n_n", "n_i*n_n", "n_i^2*n_n"],
+    "n_n": ["1", "n_i", "n_n", "n_i*n_n", "n_i^2*n_n"],
+}
+GIVEN = {
+    "free": CUBIC.only({"n_i": ["n_i", "n_n", "n_i^2", "n_i*n_n"], "n_n": ["1", "n_i*n_n"]}),
+    "leaving": FED.relate(*sorted(LEAVING)).only(EXCHANGED),
+    "conserving": FED.relate(*sorted(LEAVING), "n_i: n_n == -1 * n_n: n_n").only(EXCHANGED),
+}
+ROLES = ep.Roles(
+    exchange=[("n_n", "n_i")], outflow={"n_i": "free", "n_n": "free"}, inflow={"n_n": INFLOW},
+    nonnegative=True,
+)  # fmt: skip
+ROWS = ep.Differential(split=ep.regression.RandomSplit(0.0))
+SEARCH = ep.Regression(
+    ROWS, ep.BestSubset(6, n_best=2000), ep.FreeRunScore(window_periods=4, n_confirmed=16), depth=16
+)
+WINDOWS = ep.refinement.RefinementSettings(n_windows=20, periods=2.0)
 VOLTAGES, FLOWS = (290.0, 310.0, 330.0, 350.0, 370.0), (4.0, 4.375, 4.75, 5.125, 5.5)
 N_BETWEEN = 20
 DEFAULT_SPEED = ep.thruster.OPERATING_POINTS[3].neutral_speed
-# Those of the study: 20 windows of two periods.
-HOW = FittingSettings(CUBIC, ep.Differential(split=ep.regression.RandomSplit(0.0)), 20, 2.0)
 
 
 def recorded(point: tuple[float, float]) -> ep.Trajectory:
@@ -174,80 +172,32 @@ def recorded(point: tuple[float, float]) -> ep.Trajectory:
 
 
 def all_recorded(points: Sequence[tuple[float, float]], workers: Workers) -> list[ep.Trajectory]:
-    found = dict(workers.run(recorded, points))
-    return [found[k] for k in range(len(points))]
-
-
-def line(name: str, runs: Sequence[Evaluation]) -> str:
-    f = np.array([abs(run.f_error) for run in runs])
-    f[np.isnan(f)] = np.inf
-    amplitude = [max(abs(v - 1.0) for v in run.amplitude_ratio.values()) for run in runs]
-    waveform = [max(run.waveform_error.values()) for run in runs]
-    sustained = sum(run.holds for run in runs)
-    return (
-        f"{name:<22} {sustained} of {len(runs)} live; f {np.median(f):.2%}, 9 in 10 "
-        f"{np.quantile(f, 0.9, method='higher'):.2%}, at most {f.max():.2%}; amplitude "
-        f"{np.nanmedian(amplitude):.1%}; waveform {np.nanmedian(waveform):.3f}"
-    )
-
-
-def interpolated(known: Sequence[OperatingRecord], others: Sequence[OperatingRecord]) -> str:
-    """Errors at other points of what is fitted to the cycles of known ones, without a model."""
-    theta, wanted = (
-        QUADRATIC.evaluate(read_points([r.parameters for r in records], NAMES))
-        for records in (known, others)
-    )
-    own, true = (
-        np.array([(r.cycle.frequency_Hz, *r.cycle.std) for r in records])
-        for records in (known, others)
-    )
-    off = np.abs(wanted @ np.linalg.lstsq(theta, own, rcond=None)[0] / true - 1.0)
-    return f"f {np.median(off[:, 0]):.3%}; amplitude {np.median(off[:, 1:].max(axis=1)):.1%}"
-
-
-def left_out(
-    name: str, given: GivenModel, results: Sequence[PointResult], records: Sequence[OperatingRecord]
-) -> None:
-    """Every point by the laws of the others, of fits to rows and of refinements."""
-    for end in ("", REFINED):
-        fits = fits_of(name + end, given, results)
-        trial = LawTrial(name + end, fits, QUADRATIC, np.zeros(0))
-        runs = run_left_out(trial, records)
-        print(f"{line(name + end, [each.run for each in runs])}; {fits.n_free} free")
-        same = error_statistics(runs)
-        print(
-            f"    at the {same['n_enclosed']} that the others enclose: f {same['f_enclosed']:.3%}, "
-            f"amplitude {same['amplitude_enclosed']:.1%}; no model: f "
-            f"{same['f_interpolated']:.3%}, amplitude {same['amplitude_interpolated']:.1%}",
-            flush=True,
-        )
+    return [run for _, run in sorted(workers.run(recorded, points), key=lambda each: each[0])]
 
 
 def grid() -> None:
     workers = Loky()
     runs = all_recorded(list(product(VOLTAGES, FLOWS)), workers)
-    records = [OperatingRecord(run) for run in runs]
-    given = {
-        name: GivenModel(
-            constrain_law(
-                CUBIC.relate(*model.get("relations", ())).known(model.get("known", {})),
-                model["terms"], parameters=NAMES,
-            )
-        )
-        for name, model in MODELS.items()
-    }  # fmt: skip
-    found = fit_models(runs, given, HOW, workers=workers, rng=np.random.default_rng(0))
-    results = [found[k] for k in range(len(runs))]
-    for name, model in given.items():
-        left_out(name, model, results, records)
-    rng = np.random.default_rng(1)
-    drawn = rng.uniform((VOLTAGES[0], FLOWS[0]), (VOLTAGES[-1], FLOWS[-1]), (N_BETWEEN, 2))
+    drawn = np.random.default_rng(1).uniform(
+        (VOLTAGES[0], FLOWS[0]), (VOLTAGES[-1], FLOWS[-1]), (N_BETWEEN, 2)
+    )
     between = all_recorded([(round(v, 1), round(m, 2)) for v, m in drawn], workers)
-    print(f"between, no model: {interpolated(records, [OperatingRecord(run) for run in between])}")
-    for end in ("", REFINED):
-        law = fits_of(CHOICE + end, given[CHOICE], results).law(QUADRATIC)
-        free = [ep.evaluate(law.at(extrapolate=False, **run.parameters), run) for run in between]
-        print(line(f"between, {CHOICE}{end}", free))
+    law = ep.discovery.LawSearch("auto", WINDOWS)
+    asked = {name: (library, ep.Regression(ROWS), law) for name, library in GIVEN.items()}
+    asked["roles"] = (CUBIC.with_roles(ROLES), SEARCH, ep.discovery.LawSearch())
+    for name, (library, method, search) in asked.items():
+        found = ep.discover(runs, library, method, law=search, workers=workers)
+        choice = found.law_choice
+        assert choice is not None
+        at = [
+            ep.evaluate(choice.law.at(extrapolate=False, **run.parameters), run) for run in between
+        ]
+        print(f"{name}: {choice.choice.name}, {choice.choice.n_numbers} numbers. {choice.text}")
+        print(f"    at {N_BETWEEN} points between, it holds at {sum(run.holds for run in at)}")
+        ratios = [[1.0 + run.f_error, *run.amplitude_ratio.values()] for run in at]
+        off = np.abs(np.array(ratios) - 1.0)
+        f, amplitude = np.median(off[:, 0]), np.median(off[:, 1:].max(axis=1))
+        print(f"    and errs by {f:.3%} in frequency and {amplitude:.1%} in amplitude", flush=True)
 
 
 def main() -> None:

@@ -70,5 +70,6 @@ def test_points_of_a_law_are_models_that_torchdiffeq_integrated(refined: set[byt
     found = ep.discover(runs, law=1)
     assert found.law is not None
     assert len(found.points) == 3
-    assert all(point.model.coef.tobytes() in refined for point in found.points.values())
+    fits = next(t.fits for t in found.law_choice.trials if t.fits.statuses)
+    assert all(model.coef.tobytes() in refined for model in fits.models)
     assert np.isfinite(found.law.at(a=0.7).coef).all()

@@ -7,7 +7,7 @@ import pytest
 
 import ep2sindy as ep
 from ep2sindy.operating.interpolation import Interpolation
-from tests.test_operating_law import LINEAR, by_rows, model_at, recorded, records
+from tests.test_operating_law import by_rows, model_at, recorded
 
 LINE = ep.polynomial(["p"], degree=1)
 
@@ -46,17 +46,6 @@ def test_an_interpolation_does_not_extrapolate() -> None:
         drawn(0).at(q=2.0)
     with pytest.raises(ValueError, match="needs more points than these"):
         drawn(0, n_points=2)
-
-
-def test_errors_of_an_interpolation_are_those_of_points_left_out() -> None:
-    points = np.array([[*record.parameters.values()] for record in records()])
-    found = Interpolation.of(LINEAR, points, records())
-    assert found.states == ("x", "y")
-    k, own = 4, found.cycles
-    values = LINEAR.evaluate(points)
-    fit = np.linalg.lstsq(np.delete(values, k, 0), np.delete(own, k, 0))[0]
-    off = np.abs(values[k] @ fit / own[k] - 1.0)
-    assert found.errors[k] == pytest.approx([off[0], off[1:].max()], rel=1e-9)
 
 
 def test_a_forecast_at_a_point_that_was_not_measured_carries_a_band() -> None:

@@ -39,12 +39,7 @@ def hopf() -> ep.operating.OperatingLaw:
 def test_a_cycle_begins_where_the_fixed_point_turns_unstable() -> None:
     near = at_one()
     found = law_map(hopf(), [near], [{"a": a} for a in (-0.5, -0.1, 0.1, 1.0)])
-    assert [p.status for p in found] == [
-        Status.DECAYS,
-        Status.DECAYS,
-        Status.SUSTAINED,
-        Status.SUSTAINED,
-    ]
+    assert [p.status for p in found] == [Status.DECAYS] * 2 + [Status.SUSTAINED] * 2
     np.testing.assert_allclose([p.growth_per_s for p in found], [-0.5, -0.1, 0.1, 1.0], atol=1e-6)
     assert [p.inside for p in found] == [False, False, False, True]
     for point in found[2:]:

@@ -10,12 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
-from ep2sindy.figures.operating import (
-    FADED,
-    WRONG,
-    cycle_figure,
-    laws_figure,
-)
+from ep2sindy.figures.operating import FADED, WRONG, cycle_figure, laws_figure
 from ep2sindy.library.library import named_terms, polynomial
 from ep2sindy.operating.law import OperatingLaw
 

@@ -10,17 +10,11 @@ from scipy.integrate import solve_ivp
 from scipy.signal import lfilter
 
 import ep2sindy as ep
-from ep2sindy.operating.given_models import FittingSettings, GivenModel, PointResult, fit_models
 from ep2sindy.operating.law import constrain_law
-from ep2sindy.operating.quantities import (
-    Quantity,
-    control_functions,
-    estimate_quantities,
-    lines_of,
-)
+from ep2sindy.operating.point_fits import FAILED, PointFits, fit_rows, fit_trajectories
+from ep2sindy.operating.quantities import Quantity, control_functions, estimate_quantities, lines_of
 from ep2sindy.regression.constrained import solve_constrained
 from ep2sindy.regression.rows import RegressionRows
-from ep2sindy.runtime.parallel import Serial
 from ep2sindy.signals.spectrum import oscillation
 from tests.models import plain_rows
 
@@ -30,20 +24,14 @@ SHARED = "x: x*y*R == -1 * y: x*y*R"
 UNITS = {"x": "m^-3", "y": "m^-3", "R": "m^3/s", "u": "m/s"}
 LENGTH, INJECTED = Quantity("x: x*u", -1.0, -1), Quantity("y: 1")
 PARAMETERS = ("V", "m")
-MODELS = {
-    "free": GivenModel(
-        constrain_law(LIBRARY, TERMS, parameters=PARAMETERS),
-        {
-            "L": LENGTH,
-            "g": INJECTED,
-            "eps_x": Quantity("x: x*y*R"),
-            "eps_y": Quantity("y: x*y*R", -1.0),
-        },
-    ),
-    "constrained": GivenModel(
-        constrain_law(LIBRARY.relate(SHARED), TERMS, parameters=PARAMETERS),
-        {"L": LENGTH, "g": INJECTED, "eps": Quantity("x: x*y*R")},
-    ),
+SHARES = {"eps_x": Quantity("x: x*y*R"), "eps_y": Quantity("y: x*y*R", -1.0)}
+QUANTITIES = {
+    "free": {"L": LENGTH, "g": INJECTED} | SHARES,
+    "constrained": {"L": LENGTH, "g": INJECTED, "eps": Quantity("x: x*y*R")},
+}
+RELATIONS = {
+    name: constrain_law(LIBRARY.relate(*relations), TERMS, parameters=PARAMETERS)
+    for name, relations in {"free": [], "constrained": [SHARED]}.items()
 }
 EVERY = ep.regression.RandomSplit(0.0)
 WEAK = ep.Weak(split=EVERY)
@@ -80,7 +68,6 @@ TRUTHS = [
     {"L": 0.6, "g": 4.0, "eps": 1.8},
     {"L": 0.7, "g": 5.0, "eps": 1.5},
 ]
-Runs = Sequence[ep.Trajectory | None]
 
 
 @pytest.fixture(scope="module")
@@ -89,42 +76,43 @@ def runs() -> list[ep.Trajectory]:
     sampling = zip(TRUTHS, (0.01, 0.013, 0.008), (20, 25, 15), strict=True)
     return [
         replace(
-            forced(**truth, dt=dt, periods=periods),
-            parameters={"V": 100.0 * (k + 1), "m": 2.0**k},
+            forced(**truth, dt=dt, periods=periods), parameters={"V": 100.0 * (k + 1), "m": 2.0**k}
         )
         for k, (truth, dt, periods) in enumerate(sampling)
     ]
 
 
-def results_of(runs: Runs, formulation: ep.Weak | ep.Differential = WEAK) -> dict[int, PointResult]:
-    how = FittingSettings(LIBRARY, formulation, n_windows=10, periods=0.5)
-    return fit_models(runs, MODELS, how, workers=Serial(), rng=np.random.default_rng(0))
+def fitted(
+    runs: Sequence[ep.Trajectory], formulation: ep.Weak | ep.Differential = WEAK
+) -> dict[str, PointFits]:
+    """Every model by rows, and refined."""
+    points = np.array([[*run.parameters.values()] for run in runs])
+    rows = [formulation.assemble([r], LIBRARY, rng=np.random.default_rng(0)) for r in runs]
+    fits = {
+        name: fit_rows(PARAMETERS, points, rows, held, provenance={})
+        for name, held in RELATIONS.items()
+    }
+    windows = ep.refinement.RefinementSettings(n_windows=10, periods=0.5)
+    refined = fit_trajectories([*fits.values()], [[run] for run in runs], windows)
+    return fits | {f"{name}_refined": own for name, own in zip(fits, refined, strict=True)}
 
 
 @pytest.fixture(scope="module")
-def results(runs: list[ep.Trajectory]) -> dict[int, PointResult]:
-    """Of the three points, and of one that has no run."""
-    return results_of([*runs, None])
+def fits(runs: list[ep.Trajectory]) -> dict[str, PointFits]:
+    return fitted(runs)
 
 
-def test_quantities_of_every_point_come_back(results: dict[int, PointResult]) -> None:
+def test_quantities_of_every_point_come_back(fits: dict[str, PointFits]) -> None:
     # The data were integrated to 1e-10 and cubics of the inputs are as good: windows leave 1e-5,
     # steps of Runge-Kutta (omega dt)^4 / 120 = 1e-6 of waves with harmonics.
-    assert list(results) == [0, 1, 2]
-    for truth, result in zip(TRUTHS, results.values(), strict=True):
-        assert result.status == "oscillating"
-        assert result.f_Hz == pytest.approx(1.0, rel=1e-3)
-        expected = {"free": truth | {"eps_x": truth["eps"], "eps_y": truth["eps"]}}
-        expected["constrained"] = truth
-        for name, values in expected.items():
-            for fit in (name, f"{name}_refined"):
-                estimates = result.fits[fit].estimates
-                found = {key: estimate.value for key, estimate in estimates.items()}
-                assert found == pytest.approx({key: values[key] for key in found}, rel=1e-4)
-                assert set(found) == set(MODELS[name].quantities)
-                assert result.is_usable(fit)
-            assert result.fits[name].r2 == pytest.approx({"x": 1.0, "y": 1.0}, abs=1e-6)
-        assert result.fits["free_refined"].loss < 1e-8
+    for name, own in fits.items():
+        quantities = QUANTITIES[name.removesuffix("_refined")]
+        for truth, model in zip(TRUTHS, own.models, strict=True):
+            values = truth | {"eps_x": truth["eps"], "eps_y": truth["eps"]}
+            found = {k: each.value for k, each in estimate_quantities(model, quantities).items()}
+            assert found == pytest.approx({key: values[key] for key in quantities}, rel=1e-4)
+        assert not {*own.statuses} & {*FAILED}
+    assert max(fits["free_refined"].losses) < 1e-8
 
 
 def test_one_search_over_all_points_finds_the_terms_that_made_the_data(
@@ -143,30 +131,27 @@ def test_one_search_over_all_points_finds_the_terms_that_made_the_data(
             assert model.terms("y") == pytest.approx({"1": truth["g"], "x*y*R": -eps}, rel=1e-4)
 
 
-def test_a_relation_holds_exactly_in_fits_and_refinements(results: dict[int, PointResult]) -> None:
-    for result in results.values():
-        for fit in ("constrained", "constrained_refined"):
-            model = result.fits[fit].model
-            assert model.terms("x")["x*y*R"] == -model.terms("y")["x*y*R"]
-            # Coefficients by equation: x*u, x*y*R, 1, x*y*R.
-            assert model.covariance is not None
-            assert model.covariance[1, 1] == pytest.approx(-model.covariance[1, 3])
-
-
-def test_a_point_that_does_not_oscillate_is_kept_without_fits(runs: list[ep.Trajectory]) -> None:
-    still = replace(runs[1], states=1.0 + 1e-3 * runs[1].states)
-    (found,) = results_of([still]).values()
-    assert (found.status, dict(found.fits)) == ("steady", {})
-    assert not found.is_usable("free")
+def test_a_relation_holds_exactly_in_fits_and_refinements(fits: dict[str, PointFits]) -> None:
+    for model in [*fits["constrained"].models, *fits["constrained_refined"].models]:
+        assert model.terms("x")["x*y*R"] == -model.terms("y")["x*y*R"]
+        # Coefficients by equation: x*u, x*y*R, 1, x*y*R.
+        assert model.covariance is not None
+        assert model.covariance[1, 1] == pytest.approx(-model.covariance[1, 3])
 
 
 def test_a_point_does_not_depend_on_the_others(
-    runs: list[ep.Trajectory], results: dict[int, PointResult]
+    runs: list[ep.Trajectory], fits: dict[str, PointFits]
 ) -> None:
-    alone = results_of([None, runs[1]])
-    assert list(alone) == [1]
-    for fit, fitted in alone[1].fits.items():
-        assert fitted.estimates == results[1].fits[fit].estimates
+    for name, alone in fitted(runs[:1]).items():
+        assert alone.models[0] == fits[name].models[0]
+
+
+def test_intervals_that_cannot_be_had_end_no_fit() -> None:
+    """Three periods hold one block of two."""
+    run = replace(forced(**TRUTHS[0], periods=3.0), parameters={"V": 1.0, "m": 1.0})
+    found = fitted([run], ep.Differential(split=EVERY))["free"].models[0]
+    assert found.covariance is None
+    assert found.terms("x")["x*y*R"] == pytest.approx(TRUTHS[0]["eps"], rel=0.02)
 
 
 def wave(t: np.ndarray) -> np.ndarray:
@@ -198,7 +183,7 @@ def test_the_covariance_of_blocks_is_a_sandwich_of_their_scores() -> None:
     problems = ep.Differential(split=ep.regression.RandomSplit(0.25)).assemble(
         [noisy], LIBRARY, rng=rng
     )
-    (constraint,) = MODELS["constrained"].relations.at(np.array([[100.0, 1.0]]))
+    (constraint,) = RELATIONS["constrained"].at(np.array([[100.0, 1.0]]))
     root = solve_constrained(problems, constraint).clustered_root(50)
     (problem,) = problems
     n = int((~problem.test).sum())
@@ -259,7 +244,7 @@ def test_intervals_hold_the_truth_where_rows_depend_on_each_other() -> None:
 
 def test_a_quantity_is_a_coefficient_or_its_reciprocal() -> None:
     assert LENGTH.evaluate(np.array([-40.0, -50.0])) == pytest.approx([0.025, 0.02])
-    units = [q.unit(LIBRARY, UNITS) for q in MODELS["free"].quantities.values()]
+    units = [q.unit(LIBRARY, UNITS) for q in QUANTITIES["free"].values()]
     assert units == ["m", "m^-3 s^-1", "1", "1"]
 
 
@@ -270,7 +255,7 @@ def model_of(covariance: np.ndarray | None = None) -> ep.SparseModel:
 
 def test_ends_of_intervals_are_carried_from_coefficients_to_quantities() -> None:
     model = model_of(np.diag([4.0, 1e-4, 0.01, 4e-4]))
-    found = estimate_quantities(model, MODELS["free"].quantities)
+    found = estimate_quantities(model, QUANTITIES["free"])
     z = 1.959964
     ends = {
         "L": (1.0 / (40.0 + 2.0 * z), 1.0 / 40.0, 1.0 / (40.0 - 2.0 * z)),
@@ -316,7 +301,7 @@ def test_control_laws_may_hold_reciprocals_of_what_is_never_zero() -> None:
             "the factor not zero and the power 1 or -1, got factor=1",
         ),
         (
-            lambda: Quantity("x: 1").place(MODELS["free"].relations.common, LIBRARY),
+            lambda: Quantity("x: 1").place(RELATIONS["free"].common, LIBRARY),
             "the quantity of 'x: 1': '1' is not in the support of 'x'",
         ),
     ],
@@ -328,9 +313,12 @@ def test_settings_that_cannot_work_are_refused(make: object, message: str) -> No
 
 def test_smoothing_biases_least_squares_and_not_refinements() -> None:
     run = replace(forced(**TRUTHS[0], dt=1.0 / 25), parameters={"V": 1.0, "m": 1.0})
-    (result,) = results_of([run], ep.Differential(split=EVERY)).values()
+    both = fitted([run], ep.Differential(split=EVERY))
+    rows, refined = (
+        estimate_quantities(both[f"constrained{end}"].models[0], QUANTITIES["constrained"])
+        for end in ("", "_refined")
+    )
     for name, value in TRUTHS[0].items():
-        fitted, refined = (result.fits[f"constrained{end}"].estimates for end in ("", "_refined"))
-        assert abs(fitted[name].value / value - 1.0) == pytest.approx(0.012, rel=0.15)
-        assert not fitted[name].low < value < fitted[name].high
+        assert abs(rows[name].value / value - 1.0) == pytest.approx(0.012, rel=0.15)
+        assert not rows[name].low < value < rows[name].high
         assert refined[name].value == pytest.approx(value, rel=1e-5)

@@ -8,6 +8,7 @@ import pytest
 import ep2sindy as ep
 from ep2sindy.data.coerce import DiscoveryProblem
 from ep2sindy.library.roles import constraint_of, process_amounts
+from ep2sindy.operating.law import constrain_roles
 from ep2sindy.selection.conserving import search_conserving_systems
 from ep2sindy.selection.systems import TrialSystem, find_broken_demands
 
@@ -279,3 +280,61 @@ def test_the_default_search_keeps_what_is_known():
     found = ep.estimate(run, library.with_roles(roles))
     assert found.model.terms("y")["y"] == pytest.approx(-1 / 3, rel=1e-12)
     assert [(p.role, p.term) for p in found.constraint.known] == [("y out", "y")]
+
+
+def test_an_inflow_by_functions_of_the_point_is_exact_at_every_point_and_in_the_law(record):
+    by_point = replace(ROLES, inflow={"n_n": {"1": 0.1, "m": 2.0}})
+    library, chosen = LIBRARY.with_roles(by_point), processes(
+        ("n_n to n_i", "n_i*n_n"), ("n_i out", "n_i"), ("n_n out", "n_n")
+    )  # fmt: skip
+    points = np.array([[1.0], [3.0]])
+    held = constrain_roles(LIBRARY, STATES, chosen, by_point, parameters=["m"])
+    for (m,), own in zip(points, held.at(points), strict=True):
+        roles = replace(ROLES, inflow={"n_n": 0.1 + 2.0 * m})
+        assert library.at_operating_point({"m": m}).facts.roles == roles
+        there = constraint_of(LIBRARY, STATES, chosen, roles.known_processes)
+        assert (own.coefficients, own.processes) == (there.coefficients, there.processes)
+        assert own.known == there.known
+        assert [own.C.tolist(), own.d.tolist()] == [there.C.tolist(), there.d.tolist()]
+    model = ep.SparseModel(LIBRARY, STATES, np.zeros((len(LIBRARY), 2)))
+    line = ep.polynomial(["m"], degree=1)
+    law = held.make_law(model, line, points, np.full((3, 2), 0.7), None, "rows")
+    assert law.numbers["n_n"]["1"] == {"1": 0.1, "m": 2.0}
+    assert law.numbers["n_n"]["n_i*n_n"] == {"1": -0.7, "m": -0.7}
+    assert law.provenance["exact"] == "n_n: 1 == 0.1 + 2.0 * m"
+    with pytest.raises(ValueError, match="needs runs that have one"):
+        by_point.processes(LIBRARY, STATES)
+    with pytest.raises(ValueError, match=r"n_n in must be a sum of functions of \[\]"):
+        ep.discover(record, library, refined(3))
+
+
+def test_systems_of_several_points_come_in_one_order():
+    """Of one point twice the order is that point's; every point has amounts of its own."""
+    asked, scales = [], (1.0, 1.5)
+    for scale in scales:
+        run = balance(np.linspace(0.0, 40.0, 1001), noise=0.02)
+        run = replace(run, states=run.states * scale)
+        roles = replace(MASS_ACTION, inflow={"n_n": 0.3 * scale})
+        rows = ep.Differential().assemble([run], LIBRARY, rng=np.random.default_rng(0))
+        asked.append((DiscoveryProblem([run], LIBRARY.with_roles(roles)), rows))
+    search = ep.BestSubset(max_terms=4, n_best=60)
+    (alone,), twice, both = (
+        [own.systems for own in search_conserving_systems(points, search, depth=5)]
+        for points in (asked[:1], asked[:1] * 2, asked)
+    )
+
+    def supports(systems):
+        return [{(p.role, p.term) for p in each.constraint.processes} for each in systems]
+
+    assert supports(alone) == supports(twice[0]) == supports(twice[1])
+    assert supports(both[0]) == supports(both[1])
+    true = {("n_n to n_i", t) for t in ("n_n", "n_i*n_n")} | {
+        ("n_n out", "n_n"),
+        ("n_i out", "n_i"),
+    }
+    for scale, own in zip(scales, both, strict=True):
+        model = own[supports(own).index(true)].model
+        assert model.terms("n_n")["1"] == 0.3 * scale
+        assert model.terms("n_i")["n_i*n_n"] == pytest.approx(R / scale, rel=0.05)
+    with pytest.raises(ValueError, match="must weigh them at once"):
+        search_conserving_systems(asked, ep.AdaptiveLasso(), depth=5)

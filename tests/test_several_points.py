@@ -6,26 +6,20 @@ from functools import cache
 from itertools import combinations
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import ep2sindy as ep
 from benchmarks import known_laws
-from benchmarks.points import LIBRARY, PARAMETERS, TRUTH, realization, system_at
+from benchmarks.points import LIBRARY, METHOD, PARAMETERS, outcome, realization, system_at
+from ep2sindy.discovery import several_points
+from ep2sindy.operating.records import OperatingRecord, branches_of
 from ep2sindy.regression.rows import Formulation, RegressionRows
 from ep2sindy.selection.criteria import Selection, log_supports
-from tests.models import plain_rows
+from tests.models import lienard, plain_rows
+from tests.test_operating_law import LIBRARY as OSCILLATOR
+from tests.test_operating_law import STRUCTURE, recorded
 
-METHOD = ep.Regression(
-    ep.WeightedWeak(
-        ep.Weak(
-            test_functions=ep.regression.Bumps(half_width_s=1.5),
-            split=ep.regression.RandomSplit(0.0),
-        )
-    ),
-    ep.BestSubset(n_best=5),
-    selection=ep.EBIC(),
-    depth=5,
-)
 NAMES = ["a", "b", "c", "d", "e", "f"]
 BIC = ep.EBIC(gamma=0.0, coarsening=None)
 
@@ -380,32 +374,11 @@ def test_equations_without_terms_can_have_a_law() -> None:
 
 @pytest.mark.slow
 def test_one_support_finds_the_family_where_single_points_fail() -> None:
-    library = ep.named_terms(["V_D", "mdot_mgs"], ["1", "V_D", "mdot_mgs"])
-
-    def is_right(own: ep.Discovery) -> bool:
-        chosen = {state: front.best.terms for state, front in own.fronts.items()}
-        return all(set(chosen[state]) == set(terms) for state, terms in TRUTH.items())
-
-    def missed(models: Sequence[ep.SparseModel]) -> float:
-        true = np.array([system_at(at).model.coef for at in PARAMETERS.values()])
-        off = np.array([m.coef for m in models])[true != 0.0] / true[true != 0.0] - 1.0
-        return float(np.sqrt(np.square(off).mean()))
-
-    shared, alone, errors = [], [], []
-    for number in range(30):
-        runs = family(0.05, number)
-        found = ep.discover(runs, LIBRARY, METHOD, law=library)
-        each = ep.discover(runs, LIBRARY, METHOD).points.values()
-        shared.append(all(map(is_right, found.points.values())))
-        alone.append([is_right(own) for own in each])
-        if shared[-1]:
-            by_law = [found.law.at(**at) for at in PARAMETERS.values()]
-            errors.append([missed([p.model for p in found.points.values()]), missed(by_law)])
-    assert np.mean(shared) >= 29 / 30
-    assert np.mean(alone, axis=0).max() < 0.8
+    rows = pd.DataFrame([outcome((0.05, number)) for number in range(30)])
+    assert rows["together"].mean() >= 29 / 30
+    assert rows[[*PARAMETERS]].mean().max() < 0.8
     # Three functions for six points: half the numbers, errors smaller by sqrt(2) or more.
-    free, law = np.mean(errors, axis=0)
-    assert law < free / np.sqrt(2.0)
+    assert rows["error_law"].mean() < rows["error_alone"].mean() / np.sqrt(2.0)
 
 
 RELATIONS, KNOWN = ["n_i: n_i*n_n == -1 * n_n: n_i*n_n"], {"n_n": {"1": {"mdot_mgs": 0.015}}}
@@ -432,18 +405,6 @@ def test_relations_and_known_coefficients_are_exact_at_points_and_in_laws(
         assert n_i["n_i*n_n"] == -n_n["n_i*n_n"]
         assert n_n["1"] == pytest.approx(0.015 * point["mdot_mgs"], rel=1e-15)
     assert "exact: n_n: 1 == 0.015 * mdot_mgs" in repr(found)
-
-
-def test_terms_that_are_stated_are_those_of_every_point() -> None:
-    runs, terms = family(0.05, 3), {state: list(own) for state, own in TRUTH.items()}
-    found = ep.discover(runs, LIBRARY.only(terms), METHOD, law=1)
-    for own in found.points.values():
-        assert {s: sorted(own.model.terms(s)) for s in terms} == {
-            s: sorted(each) for s, each in terms.items()
-        }
-    assert {s: sorted(each) for s, each in found.law.numbers.items()} == {
-        s: sorted(each) for s, each in terms.items()
-    }
 
 
 @cache
@@ -489,6 +450,77 @@ def test_every_number_of_a_discovery_of_points_survives_a_file() -> None:
     for own, other in zip(again.points.values(), found.points.values(), strict=True):
         assert own.model == other.model
     assert repr(again) == repr(found)
+
+
+def lienards(scale: Mapping[tuple[float, ...], float], *names: str) -> list[ep.Trajectory]:
+    """One record at every point (parameters), of cycles that are larger by a factor."""
+    run = recorded(1.0, 0.0).run
+    return [
+        replace(run, states=run.states * each, parameters=dict(zip(names, point, strict=True)))
+        for point, each in scale.items()
+    ]
+
+
+LIENARD = OSCILLATOR.only(STRUCTURE)
+
+
+def test_where_no_law_holds_the_records_are_interpolated() -> None:
+    """Everything is faster by half between the second point and the third."""
+    runs = lienards({(1.0,): 1.0, (2.0,): 1.01, (3.0,): 1.02, (4.0,): 1.03}, "a")
+    runs[2:] = [replace(run, t=run.t / 1.5) for run in runs[2:]]
+    choice = ep.discover(runs, LIENARD, ep.Regression(), law=1).law_choice
+    assert choice.heading == "interpolate: the law holds at 0 of 2 points left out"
+    assert "take it, and not the law" in choice.text
+    assert not choice.is_trusted
+    cycle = choice.interpolation.at(a=2.5)
+    slow = OperatingRecord(runs[0]).cycle.frequency_Hz
+    assert slow < cycle.frequency_Hz[0] < 1.5 * slow
+    assert {*cycle.amplitude} == {"x", "y"}
+
+
+def test_a_second_cycle_is_set_aside_only_if_no_law_holds_at_both() -> None:
+    places = {(0.5,): 1.0, (0.7,): 1.01, (0.9,): 1.02, (1.1,): 0.2, (1.3,): 1.03, (1.5,): 1.04,
+              (1.7,): 1.05}  # fmt: skip
+    found = ep.discover(lienards(places, "a"), LIENARD, ep.Regression(), law=1)
+    assert [*found.points] == [f"a={a}" for (a,) in places if a != 1.1]
+    assert len(found.law.points) == 6
+    assert found.law_choice.cycle == "strong"
+    (warning,) = found.data_warnings
+    assert "of the 6 points on the strong one; on the other are a=1.1" in warning
+    # The factor of x^3 is 1 + 24 a b, so that the amplitude is a fifth at the last point.
+    points = [(0.0, 0.0), (0.5, 0.0), (1.0, 0.0), (0.0, 0.5), (0.0, 1.0), (1.0, 0.04), (1.0, 1.0)]
+    runs = lienards(
+        {(a, b): (1.0 + 1e-3 * k) / np.sqrt(1.0 + 24.0 * a * b) for k, (a, b) in enumerate(points)},
+        "a", "b",
+    )  # fmt: skip
+    assert branches_of([OperatingRecord(run) for run in runs]).tolist() == [0] * 6 + [1]
+    both = ep.named_terms(["a", "b"], ["1", "a*b"])
+    found = ep.discover(runs, LIENARD, ep.Regression(), law=both)
+    assert (len(found.points), found.law_choice.cycle, found.data_warnings) == (7, "all", ())
+
+
+def test_a_law_of_one_signal_is_judged_by_it_and_follows_long_windows(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    signals, windows, refine = [], [], several_points.fit_trajectories
+    for k, a in enumerate((0.9, 1.0, 1.1, 1.2)):
+        run = lienard(a)
+        x = run.states[:, :1] + 0.005 * np.random.default_rng(k).normal(size=(run.n_samples, 1))
+        signal = ep.Trajectory(run.t, x, ["p"], parameters={"a": a})
+        signals.append(ep.signals.prepare_signal(signal))
+
+    def recorded(*given: object, **settings: object) -> object:
+        windows.append(given[2].periods)
+        return refine(*given, **settings)
+
+    monkeypatch.setattr(several_points, "fit_trajectories", recorded)
+    made = ep.signals.embed_alike(signals)
+    library = made[0].library(degree=3).only({"v": ["p", "v", "p^2*v"]})
+    choice = ep.discover([each.run for each in made], library, law="auto").law_choice
+    assert windows == [8.0]
+    assert choice.choice.assessed == ["p"]
+    assert {(*point.run.assessed,) for point in choice.runs} == {(0,)}
+    assert choice.is_trusted
 
 
 UNLIKE = "runs of several operating points need the same parameters"

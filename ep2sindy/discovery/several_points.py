@@ -29,6 +29,7 @@ from ep2sindy.operating.law import (
     read_law,
 )
 from ep2sindy.operating.left_out import (
+    ALIKE,
     HOLDS,
     LawChoice,
     LawTrial,
@@ -110,7 +111,7 @@ def discover_together(
     If no law holds at most of its records and these are on two cycles, it is that of the cycle that
     most are on. given: the runs of each point, by its label.
     """
-    quiet = [] if law is None else quiet_points(given.values(), asked.states)
+    quiet = [] if law is None or asked.hidden else quiet_points(given.values(), asked.states)
     aside = {point_label(point.parameters) for point in quiet}
     records = {k: OperatingRecord(runs[0]) for k, runs in given.items() if k not in aside}
     repeat = bool(records) and all(record.repeats for record in records.values())
@@ -353,12 +354,12 @@ class _Search:
     def choose(self, law: LawFunctions | Sequence[LawFunctions]) -> LawChoice:
         """The law that does best at points left out.
 
-        Other structures are tried unless the likeliest follows every record that is left out. Under
+        Other structures are tried unless the likeliest is as good as any (ALIKE) there. Under
         roles the structures were run freely, and the best few of them are compared.
         """
         n = len(self.structures) if self.problem.roles is not None else 1
         found = self._choose(self.structures[:n], law, [])
-        if found.runs and found.choice.score > 0.0 and len(self.structures) > n:
+        if found.runs and found.choice.score > ALIKE and len(self.structures) > n:
             found = self._choose(self.structures[n:], law, found.trials)
         return found
 

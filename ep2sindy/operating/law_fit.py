@@ -50,7 +50,7 @@ def follow_windows(
     """
     at = functions.evaluate(fits.columns(functions))
     starts: list[np.ndarray | None] = [None] * len(runs)
-    best, law, tried = _Linearised([], np.inf), fits.pool(functions), fits.pool(functions)
+    best, law, tried = _LawRows([], np.inf), fits.pool(functions), fits.pool(functions)
     ahead, fraction = law, 1.0
     for _ in range(MOST_STEPS):
         found = _linearise_all(fits, tried, at, runs, (n_windows, periods), starts)
@@ -69,7 +69,7 @@ def follow_windows(
 
 
 @dataclass(frozen=True, eq=False)
-class _Linearised:
+class _LawRows:
     """Rows of all points about a law, and the mean over the points of what windows leave.
 
     starts: of the windows of every point.
@@ -87,7 +87,7 @@ def _linearise_all(
     runs: Sequence[Trajectory],
     windows: tuple[int, float],
     near: Sequence[np.ndarray | None],
-) -> _Linearised:
+) -> _LawRows:
     """windows: their number and periods. near: their starts by a law that is near, if known."""
     rows, losses, starts = [], [], []
     held = fits.relations.at(fits.points)
@@ -98,7 +98,7 @@ def _linearise_all(
         rows.append((slope, slope @ z - left))
         losses.append(loss)
         starts.append(own)
-    return _Linearised(rows, float(np.mean(losses)), starts)
+    return _LawRows(rows, float(np.mean(losses)), starts)
 
 
 def _linearise(
@@ -119,7 +119,8 @@ def _linearise(
     starts = along.fitted(first, n_ahead) if near is None else along.nearer(first, n_ahead, near)
 
     def off(of: Restarts, moved: Float[np.ndarray, "windows n_states"]) -> np.ndarray:
-        return of.off(of.paths(moved, first, n_ahead), first).reshape(len(first), -1)
+        found = of.off(of.paths(moved, first, n_ahead), first).reshape(len(first), -1)
+        return np.where(np.isfinite(found), found, np.nan)
 
     left = off(along, starts)
     by_start = [(off(along, starts + MOVED * row) - left) / MOVED for row in np.diag(along.std)]

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from ep2sindy.data.trajectory import Trajectory, point_label
 from ep2sindy.forecasting.evaluation import Evaluation, evaluate
 from ep2sindy.library.library import Library
-from ep2sindy.model.comparison import Status
+from ep2sindy.model.comparison import FreeRunBounds, Status
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.restarts import Restarts
 from ep2sindy.model.rollout import simulate
@@ -38,6 +38,8 @@ TRUSTED = 0.75
 HOLDS = 0.9  # part of its own records at which a law must hold, to be preferred to one that fails
 
 LONG, N_SAMPLES = 100.0, 2000  # periods and samples of a run at a quiet point
+
+ALIKE = 0.1  # laws whose runs deviate by less, in units of their bounds, count as equally good
 
 WORST = 5.0  # deviation, in units of its bound, of a run that does not hold
 
@@ -360,7 +362,11 @@ class LawChoice:
         said += f"Interpolation between the other records, without a model, errs by {between}"
         if self.is_trusted:
             return f"{said}."
-        return f"{said}: take it, and not the law, for a point that nobody measured."
+        bounds = FreeRunBounds()
+        is_near = found["f_interpolated"] <= bounds.frequency
+        if is_near and found["amplitude_interpolated"] <= bounds.amplitude:
+            return f"{said}: take it, and not the law, for a point that nobody measured."
+        return f"{said}: expect no less at a point that nobody measured, or record one nearby."
 
     @property
     def _windows_text(self) -> str:
@@ -370,7 +376,7 @@ class LawChoice:
 def choose_law(trials: Sequence[LawTrial]) -> LawChoice:
     """The law whose runs deviate least at points left out between others.
 
-    Laws that hold at the records that they were fitted to come before others. Of models that inputs
+    Of those that deviate by less than ALIKE there the one of fewest numbers is taken. Laws that hold at the records that they were fitted to come before others. Of models that inputs
     drive, it is the law of fewest numbers among those that err least over windows left out.
     trials: as `leave_out` returns them; without errors the last one is taken.
     """
@@ -384,7 +390,12 @@ def choose_law(trials: Sequence[LawTrial]) -> LawChoice:
         return LawChoice(trials, tested[place], [], between)
     most = max(trial.held for trial in tested)
     stay = [trial for trial in tested if trial.held == most]
-    best = min(stay, key=lambda trial: (not trial.is_sustained, trial.score, trial.error))
+
+    def rank(trial: LawTrial) -> tuple[float, ...]:
+        score, error = max(trial.score, ALIKE), max(trial.error, ACCURATE)
+        return (not trial.is_sustained, score, trial.n_numbers, error)
+
+    best = min(stay, key=rank)
     return LawChoice(trials, best, _beside(best.left_out, between), between)
 
 

@@ -16,7 +16,7 @@ from ep2sindy.data.numbers import least_squares
 from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.method import Regression
 from ep2sindy.discovery.result import Discovery
-from ep2sindy.discovery.several_points import FOUND, LawSearch
+from ep2sindy.discovery.several_points import FOUND, WINDOWS, LawSearch
 from ep2sindy.library.facts import Known
 from ep2sindy.library.library import Library, named_terms, polynomial
 from ep2sindy.library.relations import constraint
@@ -202,6 +202,7 @@ class Study:
             )
         elif self.models:
             method = Regression(self.formulation)
+            search = replace(search, windows=windows or WINDOWS)
         find = partial(
             discover, runs, library, method, seed=report.seed, workers=workers,
             progress=report.watch,
