@@ -376,8 +376,9 @@ class LawChoice:
 def choose_law(trials: Sequence[LawTrial]) -> LawChoice:
     """The law whose runs deviate least at points left out between others.
 
-    Of those that deviate by less than ALIKE there the one of fewest numbers is taken. Laws that hold at the records that they were fitted to come before others. Of models that inputs
-    drive, it is the law of fewest numbers among those that err least over windows left out.
+    Of those that deviate by less than ALIKE there the one of fewest numbers is taken. Laws that
+    hold at the records that they were fitted to come before others. Of models that inputs drive, it
+    is the law of fewest numbers among those that err least over windows left out.
     trials: as `leave_out` returns them; without errors the last one is taken.
     """
     one, tested = trials[0], [trial for trial in trials if len(trial.errors)]
