@@ -446,20 +446,18 @@ class LawConstraint:
         functions: Library,
         points: Float[np.ndarray, "points parameters"],
         free: Float[np.ndarray, "free functions"],
-        covariance: Float[np.ndarray, "_ _"] | None,
+        *,
         how: str,
-        left_out: Float[np.ndarray, " points"] | None = None,
     ) -> OperatingLaw:
         """The law of all coefficients from that of the free ones, which obeys the relations.
 
-        model: at one of the points, for its library, states and units. covariance: of free.ravel();
-        known coefficients get none. how: the fit, for the provenance.
+        model: at one of the points, for its library, states and units. how: the fit, for the
+        provenance.
         """
         # Known coefficients may be expressed in further functions, which follow the given ones.
         used = np.flatnonzero(self.D.any(axis=0))
         joined = functions + self.functions.take(used) if used.size else functions
-        spread = np.kron(self.common.C, np.eye(len(joined), len(functions)))
-        coef = (spread @ free.ravel()).reshape(-1, len(joined))
+        coef = self.common.C @ free @ np.eye(len(functions), len(joined))
         coef[:, [joined.index(self.functions.names[k]) for k in used]] += self.D[:, used]
         provenance = {"law": f"{how}, {len(points)} points"}
         if self.texts:
@@ -471,10 +469,8 @@ class LawConstraint:
             coefficients=self.common.coefficients,
             coef=coef,
             points=points,
-            covariance=None if covariance is None else spread @ covariance @ spread.T,
             units=model.units,
             provenance=provenance,
-            left_out=left_out,
         )
 
 
