@@ -82,6 +82,9 @@ class LawSearch:
         of two periods after a `TrajectorySearch`, or ten of eight if one state was made of another,
         as by `ep.embed`; under a rule that runs models, of as many periods as this takes. After any
         other `Regression` the coefficients stay those of its rows.
+    name : str, default ""
+        What the likeliest structure is called among the laws that are compared. None of them has a
+        name of its own by default: they are found_1, found_2 and so on.
 
     Examples
     --------
@@ -92,6 +95,7 @@ class LawSearch:
 
     functions: LawFunctions | Sequence[LawFunctions] = "auto"
     windows: RefinementSettings | None = None
+    name: str = ""
 
 
 def discover_together(
@@ -220,7 +224,7 @@ class _Search:
 
     def discover(self) -> Discovery:
         """One structure for all points, its coefficients at each, and their law if one is asked."""
-        found = None if self.law is None else self.find_law(self.law.functions)
+        found = None if self.law is None else self.find_law(self.law)
         fits = found.choice.fits if found else self.fit(self.structures[:1])[-1]
         points: dict[str, Discovery] = {}
         fronts, regression = self.fronts_of(fits.relations), self.regression
@@ -342,7 +346,7 @@ class _Search:
                 return [read_law(law, runs[0].parameters) for runs in self.points.values()]
         return rows.models
 
-    def find_law(self, law: LawFunctions | Sequence[LawFunctions]) -> LawChoice:
+    def find_law(self, law: LawSearch) -> LawChoice:
         """The law that does best at points left out.
 
         Other structures are tried unless the likeliest follows every record that is left out. Under
@@ -357,17 +361,19 @@ class _Search:
     def _compare(
         self,
         structures: Sequence[LawConstraint],
-        law: LawFunctions | Sequence[LawFunctions],
+        law: LawSearch,
         known: Sequence[LawTrial],
     ) -> LawChoice:
         """The best of these structures and of what is known already."""
         records, reason, trials = list(map(record_of, self.points.values())), "", list[LawTrial]()
         n, first = len(structures), len({id(trial.fits.relations) for trial in known}) + 1
         for k, fits in enumerate(self.fit(structures)):
-            name = f"{FOUND}_{first + k % n}{REFINED if fits.statuses else ''}"
+            number = first + k % n
+            name = law.name if law.name and number == 1 else f"{FOUND}_{number}"
+            name += REFINED if fits.statuses else ""
             try:
-                trial = LawTrial(name, fits, fits.functions(law), records, self.assessed)
-                trials.append(trial)
+                functions = fits.functions(law.functions)
+                trials.append(LawTrial(name, fits, functions, records, self.assessed))
             except ValueError as error:
                 reason = str(error)
         if not (trials or known):
@@ -376,7 +382,9 @@ class _Search:
         if self.windows is not None and refined:
             periods = max(1.0, self.windows.periods or PERIODS)
             n_windows = min(MOST_FOLLOWED, self.windows.n_windows)
-            follow = partial(follow_together, law=law, n_windows=n_windows, periods=periods)
+            follow = partial(
+                follow_together, law=law.functions, n_windows=n_windows, periods=periods
+            )
             stage = self.progress.stage(len(refined), "structure", "laws over all points")
             trials = [trial for trial in trials if not trial.fits.statuses]
             trials += chain(*collect(self.workers, follow, refined, stage))

@@ -285,10 +285,9 @@ def fit_trajectories(
     found = collect(workers, partial(_refine_point, settings=settings), pieces, stage)
     refined = []
     for start, at_points in zip(starts, zip(*found, strict=True), strict=True):
-        models, statuses, losses, information = map(list, zip(*at_points, strict=True))
-        of_points = {"models": models, "statuses": statuses, "losses": losses}
-        information = np.array(information)
-        refined.append(replace(start, **of_points, information=information, how="trajectories"))
+        models, statuses, losses, information = zip(*at_points, strict=True)
+        own = replace(start, models=models, statuses=statuses, losses=losses)
+        refined.append(replace(own, information=np.array(information), how="trajectories"))
     return refined
 
 

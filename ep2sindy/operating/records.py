@@ -213,17 +213,15 @@ def branches_of(records: Sequence[OperatingRecord]) -> Int[np.ndarray, " records
     left = _off_plane(values, amplitude)
     order = np.argsort(left)
     gaps = np.diff(left[order])
-    nothing = np.zeros(len(records), dtype=np.int64)
-    if len(records) < FEW or not gaps.size:
-        return nothing
+    found = np.zeros(len(records), dtype=np.int64)
+    if len(records) < FEW:
+        return found
     k = int(np.argmax(gaps))
     weak, strong = order[: k + 1], order[k + 1 :]
     inner = [np.ptp(left[group]) / len(group) for group in (weak, strong) if len(group) > FEW]
     spread = max(inner, default=np.inf)
-    if not (gaps[k] > MIN_STEP and gaps[k] > APART * spread):
-        return nothing
-    found = nothing.copy()
-    found[weak] = 1
+    if gaps[k] > MIN_STEP and gaps[k] > APART * spread:
+        found[weak] = 1
     return found
 
 

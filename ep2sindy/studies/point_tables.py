@@ -33,6 +33,7 @@ from ep2sindy.report.models import NO_ENDS, coefficients, equations, with_error
 from ep2sindy.report.report import Report
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View, percent
 from ep2sindy.signals.spectrum import Oscillation, dominant_frequency
+from ep2sindy.studies.point_processes import of_parameter
 from ep2sindy.studies.point_sources import OpenedPoint
 from ep2sindy.studies.views import EVALUATION, terms_text
 
@@ -263,24 +264,18 @@ def _by_function(rows: pd.DataFrame) -> pd.DataFrame:
 def _coefficients(found: LawChoice) -> pd.DataFrame:
     """Coefficients at every point, refined alone and from the law, each with 95 % intervals."""
     points = {record.label: record.parameters for record in found.records}
-    kinds = {
-        "alone": dict(zip(points, found.choice.fits.models, strict=True)),
-        "law": {label: read_law(found.law, point) for label, point in points.items()},
-    }
-    alone, law = (
-        coefficients(models).rename(
-            columns={"coef": kind, "lower": f"{kind}_low", "upper": f"{kind}_high"}
-        )
-        for kind, models in kinds.items()
-    )
-    at = pd.DataFrame.from_dict(points, orient="index")
-    both = law.merge(alone, how="left", on=["model", "state", "term"])
-    return at.merge(both, left_index=True, right_on="model").drop(columns="model")
+    of_law = [read_law(found.law, point) for point in points.values()]
+    both = pd.DataFrame.from_dict(points, orient="index").rename_axis("model").reset_index()
+    for kind, models in {"law": of_law, "alone": found.choice.fits.models}.items():
+        names = {"coef": kind, "lower": f"{kind}_low", "upper": f"{kind}_high"}
+        own = coefficients(dict(zip(points, models, strict=True))).rename(columns=names)
+        both = both.merge(own, how="left")
+    return both.drop(columns="model")
 
 
 def _add_left_out(report: Report, found: LawChoice, remedy: str) -> None:
     metrics: list[Metric[LeftOutRun]] = [
-        *map(_parameter, found.records[0].parameters),
+        *map(of_parameter, found.records[0].parameters),
         Metric("enclosed", lambda p: p.inside, View.SHOWN),
         Metric("f_kHz", lambda p: p.record.repeats and 1e-3 * p.record.cycle.frequency_Hz),
         *(metric.of(lambda p: p.run, view=View.SHOWN) for metric in EVALUATION),
@@ -294,10 +289,6 @@ def _add_left_out(report: Report, found: LawChoice, remedy: str) -> None:
             "not trust it at a point without a record; try points that lie closer together, longer "
             f"records, or {remedy} (docs/points.md)"
         )
-
-
-def _parameter(name: str) -> Metric[LeftOutRun]:
-    return Metric(name, lambda p: p.record.parameters[name], View.SHOWN, name, "{:g}")
 
 
 def _add_map(
@@ -329,16 +320,12 @@ def _add_map(
 
 
 def _metrics(found: LawChoice) -> list[Metric[LawTrial]]:
-    def terms(trial: LawTrial) -> str:
-        common = trial.fits.relations.common
-        return terms_text(common.support)
-
     def nine_in_ten(trial: LawTrial) -> float:
         return float(np.quantile(trial.errors, 0.9)) if len(trial.errors) else np.nan
 
     return [
         Metric("fit", lambda trial: trial.name, View.SHOWN),
-        Metric("terms", terms),
+        Metric("terms", lambda trial: terms_text(trial.fits.relations.common.support)),
         Metric("functions", lambda trial: ", ".join(trial.functions.names), View.SHOWN),
         Metric("numbers", lambda trial: trial.n_numbers, View.SHOWN),
         Metric("error", lambda trial: trial.error, View.SHOWN, format="{:.3g}"),
