@@ -311,15 +311,11 @@ class _Search:
         pieces = [(own, task.runs) for own, task in zip(systems, tasks, strict=True)]
         stage = self.progress.stage(len(pieces), "point", "free runs of systems")
         trials = collect(self.workers, partial(_try_systems, rule=rule), pieces, stage)
-        constrain = partial(
-            constrain_roles,
-            self.library,
-            self.asked.states,
-            roles=roles,
-            parameters=self.parameters,
-        )
         best = best_together(trials, rule.margin, N_ALIKE)[:N_UNDER_ROLES]
-        return [constrain(systems[0].systems[k].constraint.processes) for k in best]
+        return [
+            constrain_roles(self.library, self.asked.states, own, roles, parameters=self.parameters)
+            for own in (systems[0].systems[k].constraint.processes for k in best)
+        ]
 
     def fit(self, structures: Sequence[LawConstraint]) -> list[PointFits]:
         """All structures fitted to rows; and then all of them refined, if that is asked for."""

@@ -25,7 +25,7 @@ from ep2sindy.library.relations import Constraint, Process, Relation, constraint
 from ep2sindy.library.roles import IN, Roles, constraint_of
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.storage import covariance_in, names_in, read_as, read_stored, texts_in
-from ep2sindy.operating.records import check_varying, read_points
+from ep2sindy.operating.records import check_varying, read_points, values_at
 from ep2sindy.regression.constrained import place_coefficients
 from ep2sindy.regression.pooled import Basis
 from ep2sindy.runtime.files import write_text
@@ -198,13 +198,9 @@ class OperatingLaw:
         provenance = {**self.provenance, "point": where}
         return SparseModel(self.library, self.states, coef, self.units, provenance, covariance)
 
-    def own(self, point: Mapping[str, float]) -> dict[str, float]:
-        """The parameters of a point on which the law depends."""
-        return {name: point[name] for name in self.parameters}
-
     def is_inside(self, point: Mapping[str, float]) -> bool:
         """True if a point lies in the convex hull of the fitted points."""
-        return in_hull(self.points, read_points([self.own(point)], self.parameters)[0])
+        return in_hull(self.points, values_at([point], self.parameters)[0])
 
     def intervals(self, *, level: float = 0.95) -> dict[tuple[str, str], dict[str, Any]]:
         """(state, term) -> function -> lower and upper bound of its factor, for Gaussian errors.
@@ -339,7 +335,7 @@ class OperatingLaw:
 
 def read_law(law: OperatingLaw, point: Mapping[str, float]) -> SparseModel:
     """The law's model at a point, extrapolated if need be; the point may have more parameters."""
-    return law.at(extrapolate=True, **law.own(point))
+    return law.at(extrapolate=True, **{name: point[name] for name in law.parameters})
 
 
 def in_hull(

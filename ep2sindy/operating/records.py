@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -98,10 +98,8 @@ class OperatingRecord:
 
     @property
     def from_slowest(self) -> Trajectory:
-        """The record from its slowest sample on; all of it, if it repeats no cycle."""
-        with suppress(ValueError):
-            return self.run.window(self.slowest, self.run.n_samples)
-        return self.run
+        """The record from its slowest sample on. Raises ValueError if it repeats no cycle."""
+        return self.run.window(self.slowest, self.run.n_samples)
 
 
 @contextmanager
@@ -169,6 +167,13 @@ def read_points(
                 f"other, got {dict(point)}"
             )
     return np.array([[float(point[name]) for name in names] for point in points])
+
+
+def values_at(
+    points: Sequence[Point], names: Sequence[str]
+) -> Float[np.ndarray, "points parameters"]:
+    """Values of some parameters of points that may have more, a column for each name."""
+    return read_points([{name: point[name] for name in names} for point in points], names)
 
 
 def values_of(points: Mapping[str, Sequence[Trajectory]]) -> Float[np.ndarray, "points parameters"]:

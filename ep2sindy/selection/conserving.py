@@ -130,10 +130,7 @@ def _propose(joined: Sequence[_JoinedRows], search: Search) -> Bool[np.ndarray, 
     if len(joined) == 1:
         (one,) = joined
         return search.supports(one.xx, one.xy, one.yy)
-    if not isinstance(search, BestSubset):
-        raise ValueError(
-            f"a search of several points must weigh them at once: {search} cannot; use BestSubset"
-        )
+    assert isinstance(search, BestSubset)  # `check_shared` refuses others
     xx, xy, yy = (np.array([getattr(rows, key) for rows in joined]) for key in ("xx", "xy", "yy"))
     return search.shared_supports(xx, xy, yy)
 

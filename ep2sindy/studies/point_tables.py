@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -19,6 +20,7 @@ from ep2sindy.operating.left_out import LawChoice, LawTrial, LeftOutRun
 from ep2sindy.operating.map import MapPoint
 from ep2sindy.operating.point_fits import FAILED
 from ep2sindy.operating.quantities import (
+    LEAST_POINTS,
     ControlLaw,
     Quantity,
     control_functions,
@@ -43,39 +45,30 @@ LAW_INTERVALS = (
     "coefficients are not exactly of this form."
 )
 LEFT_OUT = (
-    "Each point in turn read off the law of the others, and run freely from one sample of its "
-    "record, where the states move least. Errors are those against the record's cycle; a model "
-    "sustained, within 1 % of frequency, 10 % of amplitude and 0.2 standard "
-    "deviations of waveform; enclosed: whether the others enclose it. Interpolated: errors of "
-    "frequency and amplitude without a model, by the functions of the law fitted to those of the "
-    "other records; of enclosed points."
+    "The law of the other points, run freely from the slowest sample of each record, with errors "
+    "against the record's cycle. A model is sustained within 1 % of frequency, 10 % of amplitude "
+    "and 0.2 standard deviations of waveform. Enclosed: by the other points. Interpolated: errors "
+    "without a model, by functions fitted to frequencies and amplitudes of the other records."
 )
 TRIED = (
-    "error: mean over the points left out, by the law of the others, of what windows of the record "
-    "leave, in standard deviations of the states; nine in ten: of the points. It tells fits apart, "
-    "also if their coefficients have a bias that is as smooth as the truth. numbers: of the law. "
-    "Chosen: the fewest numbers within a standard error of the least, of models whose cycles "
-    "attract at points left out."
+    "error: what the law of the others leaves of windows at points left out, in standard "
+    "deviations of the states, in the mean and of nine in ten points. Chosen: of laws that stay on "
+    "most of their records, the one whose runs deviate least at points left out; of models that "
+    "inputs drive, the fewest numbers within a standard error of the least error."
 )
 CAPTIONS = {
-    "laws": "Coefficients over the operating parameters, with 95 % intervals: by the law that all "
-    "points share (lines, filled at its points) and refined at each point alone (open), at up to "
-    "five values of the other parameters. Where the open points leave the lines by more than their "
-    "bars, other coefficients make up for it: points are sloppy in some directions, and those "
-    "count little.",
+    "laws": "Coefficients over the operating parameters, with 95 % intervals, at up to five values "
+    "of the other parameters. Where open marks leave the lines by more than their bars, other "
+    "coefficients make up for it: records determine these directions poorly, so they count little.",
     "map": "Frequency and relative amplitude (standard deviation over mean, of states that do not "
-    "swing around zero) of the law's cycle over the operating parameters, none where it rests, and "
-    "of the records (circles); crosses: points that do not oscillate; diamonds: records of another "
-    "cycle, not fitted here. Red: the law oscillates where the record does not, or the reverse. "
-    "Black line on a map: where the law's cycle ends; dashed: where its fixed point turns stable, "
-    "of which cycles alone tell little. Faded: beyond what the points that the law was fitted to "
-    "enclose, where it is extrapolated.",
+    "swing around zero) of the law's cycle over the operating parameters, and of the records. Red: "
+    "the law oscillates where the record does not, or the reverse. Cycles alone tell little of "
+    "where the fixed point turns stable.",
 }
 # What a law's model does at a point without a record of its cycle.
 ALONE = {Status.SUSTAINED: "oscillates", Status.DECAYS: "rests", Status.DIVERGES: "diverges"}
 
 MOST_LAWS = 3  # on the screen
-LEAST_POINTS = 3  # of a control law
 
 INTERVALS = (
     "Intervals of 95 % are sandwiches: of least squares with blocks of two periods as clusters, of "
@@ -144,7 +137,8 @@ def points_table(opened: Sequence[OpenedPoint], found: PointsFound | None = None
     """One row per operating point: status of its record, its cycle, and what the law does there."""
     rows = []
     for point in opened:
-        row: dict[str, Any] = {**point.parameters, "status": point.status, "branch": ""}
+        branch = "" if found is None else found.branch(point)
+        row: dict[str, Any] = {**point.parameters, "status": point.status, "branch": branch}
         row |= {"f_kHz": np.nan, "n_samples": 0, "dt_s": np.nan, "relative_amplitude": np.nan}
         if (run := point.run) is not None:
             row |= {"n_samples": run.n_samples, "dt_s": run.dt_s}
@@ -153,8 +147,6 @@ def points_table(opened: Sequence[OpenedPoint], found: PointsFound | None = None
             if point.status == Oscillation.OSCILLATING and record.repeats:
                 row["f_kHz"] = 1e-3 * record.cycle.frequency_Hz
                 row["relative_amplitude"] = record.relative_amplitude
-        if found is not None:
-            row["branch"] = found.branch(point)
         rows.append(row)
     table = pd.DataFrame(rows)
     if found is not None and found.maps and found.choice is not None:
@@ -182,12 +174,12 @@ def fits_table(found: PointsFound) -> pd.DataFrame:
         problems = list(dict.fromkeys(front.rows for front in fronts))
         for name, trial in found.last.items():
             fits = trial.fits
-            how = {"status": "fitted", "loss": np.nan}
+            status, loss = ("fitted", np.nan)
             if fits.statuses:
-                how = {"status": fits.statuses[k], "loss": fits.losses[k]}
-            scores = rows_r2(fits.models[k], problems)
-            scores = {f"r2_{state}": value for state, value in scores.items()}
-            rows.append({**record.parameters, "fit": name, **how, **scores})
+                status, loss = fits.statuses[k], fits.losses[k]
+            row = {**record.parameters, "fit": name, "status": status, "loss": loss}
+            r2 = rows_r2(fits.models[k], problems)
+            rows.append(row | {f"r2_{state}": value for state, value in r2.items()})
     return pd.DataFrame(rows)
 
 
@@ -367,7 +359,8 @@ def add_quantities(
     }
     errors = {name: trial.error for name, trial in found.last.items() if len(trial.errors)}
     estimates = estimates_of(found.last, own, published)
-    laws = control_laws(estimates, list(found.opened[0].parameters))
+    usable = estimates[estimates["usable"].astype(bool) & np.isfinite(estimates["value"])]
+    laws = control_laws(usable, list(found.opened[0].parameters))
     best = min((fit for fit, _ in laws), key=lambda fit: errors.get(fit, np.inf), default="")
     report.summary["best_fit"] = best or None
     missing = f"a law needs {LEAST_POINTS} points, and all parameters to vary over them"
@@ -379,7 +372,7 @@ def add_quantities(
     report.table("control_laws", ResultTable(rows, CONTROL_LAW), note=CONTROL, bold=bold)
     lines = lines_of([record.parameters for record in found.fitted.values()])
     report.section("Quantities", INTERVALS)
-    _add_figures(report, estimates, laws, published, lines, errors, labels)
+    _add_figures(report, usable, laws, published, lines, errors, labels)
     report.table("quantities", estimates, shown=False)
     shown = [
         _equation(name, law, units[fit, name], percent(2)(law.search_error))
@@ -440,25 +433,20 @@ def estimates_of(
     return table.merge(known, how="left", on=[*parameters, "fit", "quantity"])
 
 
-def control_laws(
-    estimates: pd.DataFrame, parameters: list[str]
-) -> dict[tuple[str, str], ControlLaw]:
-    """A control law per fit and quantity, from the points at which the fit finished."""
+def control_laws(usable: pd.DataFrame, parameters: list[str]) -> dict[tuple[str, str], ControlLaw]:
+    """A control law per fit and quantity, where the points suffice. usable: rows of estimates."""
     found = {}
-    for (fit, name), rows in estimates.groupby(["fit", "quantity"], sort=False):
-        used = rows[rows["usable"]]
-        points = used[parameters].to_numpy(float)
-        if len(used) >= LEAST_POINTS and np.ptp(points, axis=0).all():
+    for (fit, name), rows in usable.groupby(["fit", "quantity"], sort=False):
+        points, values = rows[parameters].to_numpy(float), rows["value"].to_numpy()
+        with suppress(ValueError):  # too few points, or a parameter that is the same at all
             functions = control_functions(parameters, points)
-            found[str(fit), str(name)] = fit_control_law(
-                used["value"].to_numpy(), points, functions
-            )
+            found[str(fit), str(name)] = fit_control_law(values, points, functions)
     return found
 
 
 def _add_figures(
     report: Report,
-    estimates: pd.DataFrame,
+    usable: pd.DataFrame,
     laws: Laws,
     published: pd.DataFrame,
     lines: Sequence[tuple[str, Mapping[str, float]]],
@@ -466,7 +454,6 @@ def _add_figures(
     labels: Mapping[str, str],
 ) -> None:
     """Add a figure of each model: its quantities by least squares, refined, and published."""
-    usable = estimates[estimates["usable"].astype(bool)]
     for model in dict.fromkeys(fit.removesuffix(REFINED) for fit in usable["fit"] if lines):
         kinds = {model: "least squares", model + REFINED: "refined"}
         best = min(kinds, key=lambda fit: errors.get(fit, np.inf))
