@@ -6,7 +6,7 @@ Relations between the coefficients, and coefficients that are known at every poi
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -481,27 +481,22 @@ def constrain_law(
     Raises ValueError for relations that `constraint` refuses, for a function that is not of the
     parameters or has no finite factor, or if no coefficient is left free.
     """
-    given = library.facts.relations
-    functions = named_terms(list(parameters), ["1"])
-    known = {}
-    for (state, term), factors in library.facts.known_factors.items():
-        own = functions_of_point(parameters, f"{state}: {term}", factors)
-        functions = functions + own
-        known[state, term] = dict(zip(own.names, factors.values(), strict=True))
-    columns = []
-    for name in functions.names:
-        # Relations are linear in their values: one function of the parameters at a time.
-        values = [replace(r, value=r.value if name == "1" else 0.0) for r in given]
-        values += [
-            Relation(((1.0, state, term),), factors.get(name, 0.0), _text(state, term, factors))
-            for (state, term), factors in known.items()
+    given, known = library.facts.relations, library.facts.known_factors
+    texts = [relation.text for relation in given]
+    texts += [_text(*place, factors) for place, factors in known.items()]
+
+    def held(values: Mapping[str, float]) -> Constraint:
+        own = [
+            Relation(((1.0, *place),), values.get(": ".join(place), 0.0), _text(*place, factors))
+            for place, factors in known.items()
         ]
-        columns.append(constraint(library, structure, values))
-    common = replace(columns[0], d=np.zeros(len(columns[0].d)))
-    texts = [r.text for r in given] + [_text(*pair, factors) for pair, factors in known.items()]
-    if texts and not len(common.free):
+        return constraint(library, structure, [*given, *own])
+
+    by_name = {": ".join(place): factors for place, factors in known.items()}
+    found = LawConstraint(*_constrain_by_point(held, by_name, parameters), tuple(texts))
+    if texts and not len(found.common.free):
         raise ValueError(f"a law needs a free coefficient: {texts} leave none; drop one of them")
-    return LawConstraint(common, functions, np.column_stack([c.d for c in columns]), tuple(texts))
+    return found
 
 
 def constrain_roles(
@@ -518,29 +513,42 @@ def constrain_roles(
     Raises ValueError for functions that are not of the parameters, or if the coefficients do not
     tell the processes apart.
     """
-    functions = named_terms(list(parameters), ["1"])
-    for state, factors in roles.by_point.items():
-        functions = functions + functions_of_point(parameters, f"{state} in", factors)
 
-    def held(inflow: Mapping[str, float]) -> Constraint:
-        numbers = {**roles.inflow, **dict.fromkeys(roles.by_point, 0.0), **inflow}
-        own = replace(roles, inflow=numbers)
+    def held(values: Mapping[str, float]) -> Constraint:
+        inflow = {state: values.get(f"{state} in", 0.0) for state in roles.by_point}
+        own = replace(roles, inflow={**roles.inflow, **inflow})
         found = constraint_of(library, states, processes, own.known_processes)
         if found is None:
             raise ValueError(f"the coefficients do not tell these roles apart: {roles}")
         return found
 
-    # What is known enters every coefficient linearly: one function of the point at a time.
+    by_name = {f"{state} in": factors for state, factors in roles.by_point.items()}
+    texts = tuple(_text(state, "1", factors) for state, factors in roles.by_point.items())
+    by_point = _constrain_by_point(held, by_name, parameters)
+    return LawConstraint(*by_point, texts, roles.by_point)
+
+
+def _constrain_by_point(
+    held: Callable[[Mapping[str, float]], Constraint],
+    known: Mapping[str, Mapping[str, float]],
+    parameters: Sequence[str],
+) -> tuple[Constraint, Library, Float[np.ndarray, "coefs functions"]]:
+    """What a `LawConstraint` holds of what is known by functions of the point.
+
+    known: name -> function -> factor. held: the relations at given values of what is known, zero if
+    absent. These enter every coefficient linearly, so one function is taken at a time.
+    """
+    functions = named_terms(list(parameters), ["1"])
     base = held({})
-    D = np.zeros((len(base.coefficients), len(functions)))
-    D[:, 0] = base.d
-    texts = []
-    for state, factors in roles.by_point.items():
-        for name, factor in factors.items():
-            D[:, functions.index(name)] += held({state: factor}).d - base.d
-        texts.append(_text(state, "1", factors))
-    common = replace(base, d=np.zeros(len(base.d)))
-    return LawConstraint(common, functions, D, tuple(texts), roles.by_point)
+    columns = {"1": base.d}
+    for name, factors in known.items():
+        own = functions_of_point(parameters, name, factors)
+        functions = functions + own
+        for function, factor in zip(own.names, factors.values(), strict=True):
+            more = held({name: factor}).d - base.d
+            columns[function] = columns.get(function, 0.0) + more
+    D = np.column_stack([columns[function] for function in functions.names])
+    return replace(base, d=np.zeros(len(base.d))), functions, D
 
 
 def _supplied(process: Process, inflow: Mapping[str, float]) -> Process:

@@ -94,6 +94,8 @@ def point_processes(choice: LawChoice, zones: Mapping[str, Zones]) -> list[Point
     zones: what the record of each point tells, by its label; a point that is absent tells nothing.
     """
     trial, fits, found = choice.choice, choice.choice.fits, []
+    if not fits.relations.common.processes:
+        return []
     pairs = zip(choice.records, fits.relations.at(fits.points), strict=True)
     for k, (record, held) in enumerate(pairs):
         at_point = partial(_at_point, record, held, zones.get(record.label, NO_ZONES))
