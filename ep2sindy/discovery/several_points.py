@@ -349,22 +349,18 @@ class _Search:
         roles the structures were run freely, and the best few of them are compared.
         """
         n = len(self.structures) if self.roles is not None else 1
-        found = self._compare(self.structures[:n], law, [])
+        found = self._compare(range(n), law, [])
         if found.runs and found.choice.score > 0.0 and len(self.structures) > n:
-            found = self._compare(self.structures[n:], law, found.trials)
+            found = self._compare(range(n, len(self.structures)), law, found.trials)
         return found
 
     def _compare(
-        self,
-        structures: Sequence[LawConstraint],
-        law: LawSearch,
-        known: Sequence[LawTrial],
+        self, places: Sequence[int], law: LawSearch, known: Sequence[LawTrial]
     ) -> LawChoice:
-        """The best of these structures and of what is known already."""
+        """The best of the structures at these places, and of what is known already."""
         records, reason, trials = list(map(record_of, self.points.values())), "", list[LawTrial]()
-        n, first = len(structures), len({id(trial.fits.relations) for trial in known}) + 1
-        for k, fits in enumerate(self.fit(structures)):
-            number = first + k % n
+        for k, fits in enumerate(self.fit([self.structures[place] for place in places])):
+            number = 1 + places[k % len(places)]
             name = law.name if law.name and number == 1 else f"{FOUND}_{number}"
             name += REFINED if fits.statuses else ""
             try:

@@ -381,13 +381,15 @@ def choose_law(trials: Sequence[LawTrial]) -> LawChoice:
 
     Laws that hold at the records that they were fitted to come before others. Of models that inputs
     drive, it is the law of fewest numbers among those that err least over windows left out.
-    trials: as `leave_out` returns them; without errors the last one is taken.
+    trials: as `leave_out` returns them; without errors, the first
+    law that stays on most records is taken, of refined fits before others.
     """
     one, tested = trials[0], [trial for trial in trials if len(trial.errors)]
     states = one.assessed or one.fits.models[0].states
     between = Interpolation.best(usual_functions(one.fits.parameters), one.records, states)
     if not tested:
-        return LawChoice(trials, trials[-1], [], between)
+        best = max(trials, key=lambda trial: (trial.share_on_cycle, bool(trial.fits.statuses)))
+        return LawChoice(trials, best, [], between)
     if one.is_driven:
         place = fewest_of_least([(trial.errors, trial.n_numbers) for trial in tested])
         return LawChoice(trials, tested[place], [], between)

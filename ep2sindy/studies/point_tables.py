@@ -96,14 +96,14 @@ class PointsFound:
     """What a study of operating points has found.
 
     trials: every fit that was tried, by its model. choice: the law that is taken; None if the
-    points do not suffice for one. first: what was found for the first model, whose rows say how
-    well derivatives are fitted. maps: the law's models at all points that were opened, then over a
+    points do not suffice for one. by_model: what was found for each model, whose rows say how well
+    derivatives are fitted. maps: the law's models at all points that were opened, then over a
     grid; empty if the law has no free runs.
     """
 
     trials: Sequence[LawTrial]
     choice: LawChoice | None
-    first: Discovery
+    by_model: Mapping[str, Discovery]
     opened: Sequence[OpenedPoint]
     maps: Sequence[MapPoint] = ()
 
@@ -122,7 +122,8 @@ class PointsFound:
     @property
     def cycle(self) -> str:
         """Name of the cycle of the records that were fitted."""
-        return "all" if self.first.law_choice is None else self.first.law_choice.cycle
+        first = next(iter(self.by_model.values())).law_choice
+        return "all" if first is None else first.cycle
 
     def branch(self, point: OpenedPoint) -> str:
         """The cycle that a point's record is on; empty if it is on none."""
@@ -170,10 +171,10 @@ def fits_table(found: PointsFound) -> pd.DataFrame:
     """One row per point and fit: its status, loss and R2 of the derivatives."""
     rows = []
     for k, (label, record) in enumerate(found.fitted.items()):
-        fronts = found.first.points[label].fronts.values()
-        problems = list(dict.fromkeys(front.rows for front in fronts))
         for name, trial in found.last.items():
-            fits = trial.fits
+            fits, only = trial.fits, found.by_model.get("")  # of terms that were searched
+            fronts = (only or found.by_model[name.removesuffix(REFINED)]).points[label].fronts
+            problems = list(dict.fromkeys(front.rows for front in fronts.values()))
             status, loss = ("fitted", np.nan)
             if fits.statuses:
                 status, loss = fits.statuses[k], fits.losses[k]

@@ -224,7 +224,7 @@ class Study:
         choice = None if first.law is None else choices[0]
         if choice is not None and len(choices) > 1:
             choice = replace(choose_law(trials), cycle=choice.cycle)
-        return PointsFound(trials, choice, first, opened)
+        return PointsFound(trials, choice, by_model, opened)
 
     def _library(
         self, opened: Sequence[OpenedPoint], signal: Embedded | None, report: Report
