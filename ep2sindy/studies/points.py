@@ -178,7 +178,7 @@ class Study:
             warnings = [text for own in by_model.values() for text in own.data_warnings]
             for text in dict.fromkeys(warnings):
                 report.warn(text)
-            found = self._join(by_model, opened)
+            found = self._join(by_model, opened, report)
             if found.choice is not None:
                 maps = self._map(found.choice, opened, workers, report)
                 found = replace(found, maps=maps)
@@ -215,9 +215,16 @@ class Study:
             return replace(found, law=None, data_warnings=(*found.data_warnings, reason))
 
     def _join(
-        self, by_model: Mapping[str, Discovery], opened: Sequence[OpenedPoint]
+        self, by_model: Mapping[str, Discovery], opened: Sequence[OpenedPoint], report: Report
     ) -> PointsFound:
-        """What was found for every model, and the best of all their laws."""
+        """What was found for every model, and the best of all their laws.
+
+        Models whose law holds on one of two cycles alone give way to those of all records.
+        """
+        most = max(len(own.points) for own in by_model.values())
+        if fewer := [name for name, own in by_model.items() if len(own.points) < most]:
+            report.warn(f"left out, for their laws hold on one cycle alone: {', '.join(fewer)}")
+        by_model = {name: own for name, own in by_model.items() if name not in fewer}
         first = next(iter(by_model.values()))
         choices = [own.law_choice for own in by_model.values() if own.law_choice is not None]
         trials = [trial for own in choices for trial in own.trials]
