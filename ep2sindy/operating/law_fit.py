@@ -74,7 +74,7 @@ def follow_windows(
     return replace(fits, rows=rows)
 
 
-class _Linearised(NamedTuple):
+class _WindowRows(NamedTuple):
     """Rows (R, y) of a point about a law, the mean square of what windows leave, their starts."""
 
     rows: tuple[Float[np.ndarray, "free free"], Float[np.ndarray, " free"]]
@@ -91,7 +91,7 @@ def _linearise(
     *,
     n_windows: int,
     periods: float,
-) -> _Linearised:
+) -> _WindowRows:
     """What windows leave at the free coefficients z, and its slopes by them, starts eliminated.
 
     Both are triangles of a QR decomposition, over the root of the number of residuals.
@@ -117,7 +117,7 @@ def _linearise(
     moves = np.nan_to_num(np.array(by_start).transpose(1, 2, 0), nan=0.0)
     known = np.isfinite(left).all(axis=1) & np.isfinite(by_coef).all(axis=(0, 2))
     if not known.any():
-        return _Linearised((np.zeros((len(z), len(z))), np.zeros(len(z))), LOST, starts)
+        return _WindowRows((np.zeros((len(z), len(z))), np.zeros(len(z))), LOST, starts)
     rows = np.concatenate([slopes, left[..., None]], axis=-1)[known]
     basis, _ = np.linalg.qr(moves[known])
     rows = (rows - basis @ (basis.transpose(0, 2, 1) @ rows)).reshape(-1, len(z) + 1)
@@ -125,4 +125,4 @@ def _linearise(
     _, triangle = np.linalg.qr(rows / np.sqrt(len(rows)))
     share = float(known.mean())
     R, left = triangle[: len(z), :-1], triangle[: len(z), -1]
-    return _Linearised((R, R @ z - left), share * loss + (1.0 - share) * LOST, starts)
+    return _WindowRows((R, R @ z - left), share * loss + (1.0 - share) * LOST, starts)
