@@ -161,6 +161,14 @@ def test_own_records_make_a_law_of_the_model_that_is_chosen_and_its_line(tmp_pat
     assert found.report.headline["n_sustained"] == 3
 
 
+def test_models_of_unlike_terms_are_scored_by_their_own_rows(tmp_path: Path) -> None:
+    more = "++models.more={terms: {n_i: [n_i,n_n,'n_i^3'], n_n: ['1',n_i]}}"
+    found = programs.computed(composed(*own_records(tmp_path, 0.6, 0.9, 1.2), more))
+    fits = pd.read_csv(found.folder / "tables" / "fits.csv").groupby("fit")["r2_n_n"].min()
+    assert fits.index.tolist() == ["more", "more_refined", "own", "own_refined"]
+    assert fits["more"] == pytest.approx(fits["own"], abs=1e-3)
+
+
 def test_without_a_model_the_terms_are_searched_for(tmp_path: Path) -> None:
     records = own_records(tmp_path, 0.6, 0.9, 1.2)
     found = programs.computed(composed(*records, "models=null", "++degree=3", "map_points=1"))

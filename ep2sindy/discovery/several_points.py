@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from itertools import chain, product
 from math import prod
@@ -30,7 +30,7 @@ from ep2sindy.operating.law import (
 )
 from ep2sindy.operating.left_out import (
     ALIKE,
-    HOLDS,
+    MOST,
     LawChoice,
     LawTrial,
     choose_law,
@@ -83,6 +83,9 @@ class LawSearch:
         of two periods after a `TrajectorySearch`, or ten of eight if one state was made of another,
         as by `ep.embed`; under a rule that runs models, of as many periods as this takes. After any
         other `Regression` the coefficients stay those of its rows.
+    name : str, default ""
+        What the likeliest structure is called among the laws that are compared. None of them has a
+        name of its own by default: they are found_1, found_2 and so on.
 
     Examples
     --------
@@ -93,6 +96,7 @@ class LawSearch:
 
     functions: LawFunctions | Sequence[LawFunctions] = "auto"
     windows: RefinementSettings | None = None
+    name: str = ""
 
 
 def discover_together(
@@ -113,35 +117,40 @@ def discover_together(
     """
     quiet = [] if law is None or asked.hidden else quiet_points(given.values(), asked.states)
     aside = {point_label(point.parameters) for point in quiet}
-    records = {k: OperatingRecord(runs[0]) for k, runs in given.items() if k not in aside}
+    records = {k: record_of(runs) for k, runs in given.items() if k not in aside}
     repeat = bool(records) and all(record.repeats for record in records.values())
     points = {k: runs for k, runs in given.items() if not (repeat and k in aside)}
     if not repeat or {*asked.library.variables} - {*asked.states}:
         quiet = []  # what rests under inputs depends on theirs
-    problem = PointsProblem(asked, points, method, law, workers, quiet)
-    found = problem.discover(rng=rng, progress=progress)
+    search = _Search(asked, points, method, law, quiet, workers=workers, rng=rng, progress=progress)
+    found = search.discover()
     choice = found.law_choice
-    if choice is None or choice.choice.held == HOLDS or not repeat:
+    if choice is None or choice.choice.share_on_cycle == MOST or not repeat:
         return found
     numbers = branches_of([*records.values()])
     main = int(2 * numbers.sum() > len(numbers))
     others = [label for label, number in zip(records, numbers, strict=True) if number != main]
     if not others:
         return found
-    one = replace(problem, points={k: runs for k, runs in points.items() if k not in others})
-    found = one.discover(rng=rng, progress=progress)
+    points = {k: runs for k, runs in points.items() if k not in others}
+    found = replace(search, points=points).discover()
     assert found.law_choice is not None
     cycle = ("strong", "weak")[main]
     note = (
-        f"two cycles coexist: the law is that of the {len(one.points)} points on the {cycle} one; "
+        f"two cycles coexist: the law is that of the {len(points)} points on the {cycle} one; "
         f"on the other are {', '.join(others)}"
     )
     choice = replace(found.law_choice, cycle=cycle)
     return replace(found, law_choice=choice, data_warnings=(*found.data_warnings, note))
 
 
+def record_of(runs: Sequence[Trajectory]) -> OperatingRecord:
+    """The record of a point by which laws are judged: its longest run."""
+    return OperatingRecord(max(runs, key=lambda run: run.n_samples))
+
+
 @dataclass(frozen=True, eq=False)
-class PointsProblem:
+class _Search:
     """What is asked of several operating points together, and the method that answers it.
 
     points: the runs of each point, by its label. law: None asks for one structure alone. quiet:
@@ -153,8 +162,10 @@ class PointsProblem:
     points: Mapping[str, Sequence[Trajectory]]
     method: DiscoveryMethod
     law: LawSearch | None
-    workers: Workers
-    quiet: Sequence[QuietPoint] = ()
+    quiet: Sequence[QuietPoint]
+    workers: Workers = field(kw_only=True)
+    rng: np.random.Generator = field(kw_only=True)
+    progress: Progress = field(kw_only=True)
 
     def __post_init__(self) -> None:
         if self.asked.hidden:
@@ -212,19 +223,15 @@ class PointsProblem:
         """The states that laws are judged by: those that were not made of others."""
         return [state for state in self.asked.states if state not in self.asked.made]
 
-    def discover(self, *, rng: np.random.Generator, progress: Progress) -> Discovery:
+    def discover(self) -> Discovery:
         """One structure for all points, its coefficients at each, and their law if one is asked."""
-        search = _Search(self, self._rows(rng, progress), rng, progress)
-        if self.law is None:
-            fits, found = search.fit(search.structures[:1])[-1], None
-        else:
-            found = search.choose(self.law.functions)
-            fits = found.choice.fits
+        found = None if self.law is None else self.find_law(self.law)
+        fits = found.choice.fits if found else self.fit(self.structures[:1])[-1]
         points: dict[str, Discovery] = {}
-        fronts, regression = search.fronts_of(fits.relations), self.regression
+        fronts, regression = self.fronts_of(fits.relations), self.regression
         for k, (label, same_point) in enumerate(self.points.items()):
             own = [front.points[label] for front in fronts]
-            alike = [each for part in search.problems[label] for each in ambiguities(part)]
+            alike = [each for part in self.problems[label] for each in ambiguities(part)]
             points[label] = replace(
                 join_choice(own, [f.best for f in own], fits.models[k], regression),
                 model=replace(fits.models[k], clock=same_point[0].clock),
@@ -234,26 +241,17 @@ class PointsProblem:
             )
         return join_points(points, self.values, found)
 
-    def _rows(self, rng: np.random.Generator, progress: Progress) -> Problems:
+    @cached_property
+    def problems(self) -> Problems:
         """Rows of every point, made in the order of their names, so that theirs does not count."""
         form = self.regression.formulation
         library = self.asked.at_point.with_known_terms(self.asked.states)
-        labels = count_pieces(progress, sorted(self.points), "point", "rows of the regression")
+        labels = count_pieces(self.progress, sorted(self.points), "point", "rows of the regression")
         rows = {
-            label: form.assemble([r.complete() for r in self.points[label]], library, rng=rng)
+            label: form.assemble([r.complete() for r in self.points[label]], library, rng=self.rng)
             for label in labels
         }
         return {label: rows[label] for label in self.points}
-
-
-@dataclass(frozen=True, eq=False)
-class _Search:
-    """The structures of a problem, and the laws of their fits. problems: rows of every point."""
-
-    problem: PointsProblem
-    problems: Problems
-    rng: np.random.Generator
-    progress: Progress
 
     @cached_property
     def library(self) -> Library:
@@ -263,32 +261,30 @@ class _Search:
     @cached_property
     def fronts(self) -> list[SharedFront]:
         """Supports of every equation that all points share."""
-        one = self.problem
-        return search_shared(self.problems, one.asked, one.regression, progress=self.progress)
+        return search_shared(self.problems, self.asked, self.regression, progress=self.progress)
 
     def fronts_of(self, structure: LawConstraint) -> list[SharedFront]:
         """The fronts whose best supports are those of this structure."""
-        one, terms = self.problem, structure.common.support
-        if one.roles is None and all({*f.chosen} == {*terms[f.equation]} for f in self.fronts):
+        terms = structure.common.support
+        if self.roles is None and all({*f.chosen} == {*terms[f.equation]} for f in self.fronts):
             return self.fronts
-        known = replace(one.asked, library=self.library.only(terms))
-        rule = replace(one.regression, selection=EBIC())
+        known = replace(self.asked, library=self.library.only(terms))
+        rule = replace(self.regression, selection=EBIC())
         return search_shared(self.problems, known, rule, progress=self.progress)
 
     @cached_property
     def structures(self) -> list[LawConstraint]:
         """The structures to be compared, the likeliest first."""
-        one = self.problem
-        if one.roles is not None:
-            return self._under_roles(one.roles)
+        if self.roles is not None:
+            return self._under_roles(self.roles)
         chosen = {front.equation: front.chosen for front in self.fronts}
-        found = [constrain_law(one.asked.library, chosen, parameters=one.parameters)]
-        if one.law is None or one.windows is None:
+        found = [constrain_law(self.asked.library, chosen, parameters=self.parameters)]
+        if self.law is None or self.windows is None:
             return found
-        sizes = MADE_SIZES if one.asked.made else SIZES
+        sizes = MADE_SIZES if self.asked.made else SIZES
         supports = [
             [front.chosen]
-            if front.equation in one.asked.facts.only
+            if front.equation in self.asked.facts.only
             else [s for s in front.supports if len(s) in sizes] or [front.chosen]
             for front in self.fronts
         ]
@@ -297,102 +293,95 @@ class _Search:
             support = dict(zip(chosen, terms, strict=True))
             with suppress(ValueError):  # relations that these terms cannot keep
                 if support != chosen:
-                    own = constrain_law(one.asked.library, support, parameters=one.parameters)
+                    own = constrain_law(self.asked.library, support, parameters=self.parameters)
                     found.append(own)
         return found
 
     def _under_roles(self, roles: Roles) -> list[LawConstraint]:
         """Structures that keep the roles at every point, the best by free runs of each first."""
-        one, regression = self.problem, self.problem.regression
-        rule = regression.selection
+        regression, rule = self.regression, self.regression.selection
         if not isinstance(rule, FreeRunScore):
             raise ValueError(
                 "roles tie all equations together, so a rule must rank whole systems: selection "
                 f"must be FreeRunScore(), got {rule!r}"
             )
-        tasks = [replace(one.asked, runs=runs) for runs in one.points.values()]
+        tasks = [replace(self.asked, runs=runs) for runs in self.points.values()]
         tasks = [replace(task, library=task.at_point) for task in tasks]
         asked = list(zip(tasks, self.problems.values(), strict=True))
         systems = search_conserving_systems(asked, regression.search, depth=regression.depth)
         pieces = [(own, task.runs) for own, task in zip(systems, tasks, strict=True)]
         stage = self.progress.stage(len(pieces), "point", "free runs of systems")
-        trials = collect(one.workers, partial(_try_systems, rule=rule), pieces, stage)
-        constrain = partial(
-            constrain_roles, self.library, one.asked.states, roles=roles, parameters=one.parameters
-        )
+        trials = collect(self.workers, partial(_try_systems, rule=rule), pieces, stage)
         best = best_together(trials, rule.margin, N_ALIKE)[:N_UNDER_ROLES]
-        return [constrain(systems[0].systems[k].constraint.processes) for k in best]
+        return [
+            constrain_roles(self.library, self.asked.states, own, roles, parameters=self.parameters)
+            for own in (systems[0].systems[k].constraint.processes for k in best)
+        ]
 
     def fit(self, structures: Sequence[LawConstraint]) -> list[PointFits]:
         """All structures fitted to rows; and then all of them refined, if that is asked for."""
-        one = self.problem
         rows = [
             fit_rows(
-                one.parameters, one.values, list(self.problems.values()), structure,
-                provenance=one.regression.provenance, quiet=one.quiet,
+                self.parameters, self.values, list(self.problems.values()), structure,
+                provenance=self.regression.provenance, quiet=self.quiet,
             )
             for structure in structures
         ]  # fmt: skip
-        if one.windows is None:
+        if self.windows is None:
             return rows
         refined = fit_trajectories(
-            rows, list(one.points.values()), one.windows, first=list(map(self._first, rows)),
-            seed=self.rng, workers=one.workers, progress=self.progress,
+            rows, list(self.points.values()), self.windows, first=list(map(self._first, rows)),
+            seed=self.rng, workers=self.workers, progress=self.progress,
         )  # fmt: skip
         return [*rows, *refined]
 
     def _first(self, rows: PointFits) -> Sequence[SparseModel]:
         """Models to begin refinements with: of a law, which averages the noise of all rows."""
-        law = None if self.problem.law is None else self.problem.law.functions
         with suppress(ValueError):
-            if law is not None:
-                of_rows = rows.law(rows.functions(law))
-                at = [dict(zip(rows.parameters, p, strict=True)) for p in rows.points.tolist()]
-                return [read_law(of_rows, point) for point in at]
+            if self.law is not None:
+                law = rows.law(rows.functions(self.law.functions))
+                return [read_law(law, runs[0].parameters) for runs in self.points.values()]
         return rows.models
 
-    def choose(self, law: LawFunctions | Sequence[LawFunctions]) -> LawChoice:
+    def find_law(self, law: LawSearch) -> LawChoice:
         """The law that does best at points left out.
 
         Other structures are tried unless the likeliest is as good as any (ALIKE) there. Under
         roles the structures were run freely, and the best few of them are compared.
         """
-        n = len(self.structures) if self.problem.roles is not None else 1
-        found = self._choose(self.structures[:n], law, [])
+        n = len(self.structures) if self.roles is not None else 1
+        found = self._compare(range(n), law, [])
         if found.runs and found.choice.score > ALIKE and len(self.structures) > n:
-            found = self._choose(self.structures[n:], law, found.trials)
+            found = self._compare(range(n, len(self.structures)), law, found.trials)
         return found
 
-    def _choose(
-        self,
-        structures: Sequence[LawConstraint],
-        law: LawFunctions | Sequence[LawFunctions],
-        known: Sequence[LawTrial],
+    def _compare(
+        self, places: Sequence[int], law: LawSearch, known: Sequence[LawTrial]
     ) -> LawChoice:
-        """The best of these structures and of what is known already."""
-        one, reason, trials = self.problem, "", list[LawTrial]()
-        longest = partial(max, key=lambda run: run.n_samples)
-        records = [OperatingRecord(longest(runs)) for runs in one.points.values()]
-        n, first = len(structures), len({id(trial.fits.relations) for trial in known}) + 1
-        fits = self.fit(structures)
-        for k, own in enumerate(fits):
-            name = f"{FOUND}_{first + k % n}{REFINED if own.statuses else ''}"
+        """The best of the structures at these places, and of what is known already."""
+        records, reason, trials = list(map(record_of, self.points.values())), "", list[LawTrial]()
+        for k, fits in enumerate(self.fit([self.structures[place] for place in places])):
+            number = 1 + places[k % len(places)]
+            name = law.name if law.name and number == 1 else f"{FOUND}_{number}"
+            name += REFINED if fits.statuses else ""
             try:
-                trial = LawTrial(name, own, own.functions(law), records, one.assessed)
-                trials.append(trial)
+                functions = fits.functions(law.functions)
+                trials.append(LawTrial(name, fits, functions, records, self.assessed))
             except ValueError as error:
                 reason = str(error)
         if not (trials or known):
             raise ValueError(reason)
-        if one.windows is not None:
-            periods = max(1.0, one.windows.periods or PERIODS)
-            n_windows = min(MOST_FOLLOWED, one.windows.n_windows)
-            follow = partial(follow_together, law=law, n_windows=n_windows, periods=periods)
-            refined = [trial for trial in trials if trial.fits.statuses]
+        refined = [trial for trial in trials if trial.fits.statuses]
+        if self.windows is not None and refined:
+            periods = max(1.0, self.windows.periods or PERIODS)
+            n_windows = min(MOST_FOLLOWED, self.windows.n_windows)
+            follow = partial(
+                follow_together, law=law.functions, n_windows=n_windows, periods=periods
+            )
             stage = self.progress.stage(len(refined), "structure", "laws over all points")
             trials = [trial for trial in trials if not trial.fits.statuses]
-            trials += chain(*collect(one.workers, follow, refined, stage))
-        tested = leave_out(trials, workers=one.workers, progress=self.progress)
+            trials += chain(*collect(self.workers, follow, refined, stage))
+        tested = leave_out(trials, workers=self.workers, progress=self.progress)
         return choose_law([*known, *tested])
 
 

@@ -14,7 +14,7 @@ from scipy.special import stdtrit
 from ep2sindy.data.trajectory import point_label
 from ep2sindy.library.library import Library
 from ep2sindy.operating.law import in_hull, make_basis, outside
-from ep2sindy.operating.records import OperatingRecord, read_points
+from ep2sindy.operating.records import OperatingRecord, read_points, values_at
 from ep2sindy.regression.pooled import Basis
 from ep2sindy.runtime.values import read_only
 
@@ -61,8 +61,8 @@ class Interpolation:
         functions: Library, records: Sequence[OperatingRecord], states: Sequence[str]
     ) -> Interpolation:
         """Of some states between records. Raises ValueError for a record without a cycle."""
-        names, columns = functions.variables, [records[0].run.state_names.index(s) for s in states]
-        points = read_points([{n: r.parameters[n] for n in names} for r in records], names)
+        columns = [records[0].run.state_names.index(state) for state in states]
+        points = values_at([record.parameters for record in records], functions.variables)
         cycles = np.array([(r.cycle.frequency_Hz, *r.cycle.std[columns]) for r in records])
         return Interpolation(functions, points, tuple(states), cycles)
 

@@ -6,7 +6,7 @@ Relations between the coefficients, and coefficients that are known at every poi
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -25,7 +25,7 @@ from ep2sindy.library.relations import Constraint, Process, Relation, constraint
 from ep2sindy.library.roles import IN, Roles, constraint_of
 from ep2sindy.model.model import SparseModel
 from ep2sindy.model.storage import covariance_in, names_in, read_as, read_stored, texts_in
-from ep2sindy.operating.records import check_varying, read_points
+from ep2sindy.operating.records import check_varying, read_points, values_at
 from ep2sindy.regression.constrained import place_coefficients
 from ep2sindy.regression.pooled import Basis
 from ep2sindy.runtime.files import write_text
@@ -198,13 +198,9 @@ class OperatingLaw:
         provenance = {**self.provenance, "point": where}
         return SparseModel(self.library, self.states, coef, self.units, provenance, covariance)
 
-    def own(self, point: Mapping[str, float]) -> dict[str, float]:
-        """The parameters of a point on which the law depends."""
-        return {name: point[name] for name in self.parameters}
-
     def is_inside(self, point: Mapping[str, float]) -> bool:
         """True if a point lies in the convex hull of the fitted points."""
-        return in_hull(self.points, read_points([self.own(point)], self.parameters)[0])
+        return in_hull(self.points, values_at([point], self.parameters)[0])
 
     def intervals(self, *, level: float = 0.95) -> dict[tuple[str, str], dict[str, Any]]:
         """(state, term) -> function -> lower and upper bound of its factor, for Gaussian errors.
@@ -339,7 +335,7 @@ class OperatingLaw:
 
 def read_law(law: OperatingLaw, point: Mapping[str, float]) -> SparseModel:
     """The law's model at a point, extrapolated if need be; the point may have more parameters."""
-    return law.at(extrapolate=True, **law.own(point))
+    return law.at(extrapolate=True, **{name: point[name] for name in law.parameters})
 
 
 def in_hull(
@@ -446,20 +442,18 @@ class LawConstraint:
         functions: Library,
         points: Float[np.ndarray, "points parameters"],
         free: Float[np.ndarray, "free functions"],
-        covariance: Float[np.ndarray, "_ _"] | None,
+        *,
         how: str,
-        left_out: Float[np.ndarray, " points"] | None = None,
     ) -> OperatingLaw:
         """The law of all coefficients from that of the free ones, which obeys the relations.
 
-        model: at one of the points, for its library, states and units. covariance: of free.ravel();
-        known coefficients get none. how: the fit, for the provenance.
+        model: at one of the points, for its library, states and units. how: the fit, for the
+        provenance.
         """
         # Known coefficients may be expressed in further functions, which follow the given ones.
         used = np.flatnonzero(self.D.any(axis=0))
         joined = functions + self.functions.take(used) if used.size else functions
-        spread = np.kron(self.common.C, np.eye(len(joined), len(functions)))
-        coef = (spread @ free.ravel()).reshape(-1, len(joined))
+        coef = self.common.C @ free @ np.eye(len(functions), len(joined))
         coef[:, [joined.index(self.functions.names[k]) for k in used]] += self.D[:, used]
         provenance = {"law": f"{how}, {len(points)} points"}
         if self.texts:
@@ -471,10 +465,8 @@ class LawConstraint:
             coefficients=self.common.coefficients,
             coef=coef,
             points=points,
-            covariance=None if covariance is None else spread @ covariance @ spread.T,
             units=model.units,
             provenance=provenance,
-            left_out=left_out,
         )
 
 
@@ -489,27 +481,22 @@ def constrain_law(
     Raises ValueError for relations that `constraint` refuses, for a function that is not of the
     parameters or has no finite factor, or if no coefficient is left free.
     """
-    given = library.facts.relations
-    functions = named_terms(list(parameters), ["1"])
-    known = {}
-    for (state, term), factors in library.facts.known_factors.items():
-        own = functions_of_point(parameters, f"{state}: {term}", factors)
-        functions = functions + own
-        known[state, term] = dict(zip(own.names, factors.values(), strict=True))
-    columns = []
-    for name in functions.names:
-        # Relations are linear in their values: one function of the parameters at a time.
-        values = [replace(r, value=r.value if name == "1" else 0.0) for r in given]
-        values += [
-            Relation(((1.0, state, term),), factors.get(name, 0.0), _text(state, term, factors))
-            for (state, term), factors in known.items()
+    given, known = library.facts.relations, library.facts.known_factors
+    texts = [relation.text for relation in given]
+    texts += [_text(*place, factors) for place, factors in known.items()]
+
+    def held(values: Mapping[str, float]) -> Constraint:
+        own = [
+            Relation(((1.0, *place),), values.get(": ".join(place), 0.0), _text(*place, factors))
+            for place, factors in known.items()
         ]
-        columns.append(constraint(library, structure, values))
-    common = replace(columns[0], d=np.zeros(len(columns[0].d)))
-    texts = [r.text for r in given] + [_text(*pair, factors) for pair, factors in known.items()]
-    if texts and not len(common.free):
+        return constraint(library, structure, [*given, *own])
+
+    by_name = {": ".join(place): factors for place, factors in known.items()}
+    found = LawConstraint(*_constrain_by_point(held, by_name, parameters), tuple(texts))
+    if texts and not len(found.common.free):
         raise ValueError(f"a law needs a free coefficient: {texts} leave none; drop one of them")
-    return LawConstraint(common, functions, np.column_stack([c.d for c in columns]), tuple(texts))
+    return found
 
 
 def constrain_roles(
@@ -526,29 +513,42 @@ def constrain_roles(
     Raises ValueError for functions that are not of the parameters, or if the coefficients do not
     tell the processes apart.
     """
-    functions = named_terms(list(parameters), ["1"])
-    for state, factors in roles.by_point.items():
-        functions = functions + functions_of_point(parameters, f"{state} in", factors)
 
-    def held(inflow: Mapping[str, float]) -> Constraint:
-        numbers = {**roles.inflow, **dict.fromkeys(roles.by_point, 0.0), **inflow}
-        own = replace(roles, inflow=numbers)
+    def held(values: Mapping[str, float]) -> Constraint:
+        inflow = {state: values.get(f"{state} in", 0.0) for state in roles.by_point}
+        own = replace(roles, inflow={**roles.inflow, **inflow})
         found = constraint_of(library, states, processes, own.known_processes)
         if found is None:
             raise ValueError(f"the coefficients do not tell these roles apart: {roles}")
         return found
 
-    # What is known enters every coefficient linearly: one function of the point at a time.
+    by_name = {f"{state} in": factors for state, factors in roles.by_point.items()}
+    texts = tuple(_text(state, "1", factors) for state, factors in roles.by_point.items())
+    by_point = _constrain_by_point(held, by_name, parameters)
+    return LawConstraint(*by_point, texts, roles.by_point)
+
+
+def _constrain_by_point(
+    held: Callable[[Mapping[str, float]], Constraint],
+    known: Mapping[str, Mapping[str, float]],
+    parameters: Sequence[str],
+) -> tuple[Constraint, Library, Float[np.ndarray, "coefs functions"]]:
+    """What a `LawConstraint` holds of what is known by functions of the point.
+
+    known: name -> function -> factor. held: the relations at given values of what is known, zero if
+    absent. These enter every coefficient linearly, so one function is taken at a time.
+    """
+    functions = named_terms(list(parameters), ["1"])
     base = held({})
-    D = np.zeros((len(base.coefficients), len(functions)))
-    D[:, 0] = base.d
-    texts = []
-    for state, factors in roles.by_point.items():
-        for name, factor in factors.items():
-            D[:, functions.index(name)] += held({state: factor}).d - base.d
-        texts.append(_text(state, "1", factors))
-    common = replace(base, d=np.zeros(len(base.d)))
-    return LawConstraint(common, functions, D, tuple(texts), roles.by_point)
+    columns = {"1": base.d}
+    for name, factors in known.items():
+        own = functions_of_point(parameters, name, factors)
+        functions = functions + own
+        for function, factor in zip(own.names, factors.values(), strict=True):
+            more = held({name: factor}).d - base.d
+            columns[function] = columns.get(function, 0.0) + more
+    D = np.column_stack([columns[function] for function in functions.names])
+    return replace(base, d=np.zeros(len(base.d))), functions, D
 
 
 def _supplied(process: Process, inflow: Mapping[str, float]) -> Process:

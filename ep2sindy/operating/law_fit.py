@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -16,7 +17,6 @@ from ep2sindy.model.restarts import MOVED, Restarts
 from ep2sindy.operating.point_fits import PointFits
 from ep2sindy.refinement.refine import with_coef
 from ep2sindy.refinement.windows import dominant_window
-from ep2sindy.regression.constrained import read_coefficients
 
 ACCURATE = 1e-5  # error of a step between samples, as a fraction of the largest one
 
@@ -49,71 +49,56 @@ def follow_windows(
     periods: number of windows of every record, and their length.
     """
     at = functions.evaluate(fits.columns(functions))
-    starts: list[np.ndarray | None] = [None] * len(runs)
-    best, law, tried = _LawRows([], np.inf), fits.pool(functions), fits.pool(functions)
-    ahead, fraction = law, 1.0
+    points = list(zip(fits.models, fits.relations.at(fits.points), runs, at, strict=True))
+    starts: Sequence[np.ndarray | None] = [None] * len(points)
+    law = ahead = tried = fits.pool(functions)
+    rows, least, fraction = fits.rows, np.inf, 1.0
     for _ in range(MOST_STEPS):
-        found = _linearise_all(fits, tried, at, runs, (n_windows, periods), starts)
-        gain = best.loss - found.loss
+        found = [
+            _linearise(model, held, run, tried @ own, near, n_windows=n_windows, periods=periods)
+            for (model, held, run, own), near in zip(points, starts, strict=True)
+        ]
+        loss = float(np.mean([at_point.loss for at_point in found]))
+        gain = least - loss
         if gain > 0.0:
-            best, law, fraction, starts = found, tried, 1.0, [*found.starts]
-            if gain < SETTLED * found.loss:
+            rows, starts = [at_point.rows for at_point in found], [each.starts for each in found]
+            law, least, fraction = tried, loss, 1.0
+            if gain < SETTLED * least:
                 break
-            ahead = replace(fits, rows=best.rows).pool(functions)
+            ahead = replace(fits, rows=rows).pool(functions)
         else:
             fraction *= CUT
             if fraction < SMALLEST:
                 break
         tried = law + fraction * (ahead - law)
-    return replace(fits, rows=best.rows)
+    return replace(fits, rows=rows)
 
 
-@dataclass(frozen=True, eq=False)
-class _LawRows:
-    """Rows of all points about a law, and the mean over the points of what windows leave.
+class _WindowRows(NamedTuple):
+    """Rows (R, y) of a point about a law, the mean square of what windows leave, their starts."""
 
-    starts: of the windows of every point.
-    """
-
-    rows: Sequence[tuple[Float[np.ndarray, "free free"], Float[np.ndarray, " free"]]]
+    rows: tuple[Float[np.ndarray, "free free"], Float[np.ndarray, " free"]]
     loss: float
-    starts: Sequence[np.ndarray] = ()
-
-
-def _linearise_all(
-    fits: PointFits,
-    law: Float[np.ndarray, "free functions"],
-    at: Float[np.ndarray, "points functions"],
-    runs: Sequence[Trajectory],
-    windows: tuple[int, float],
-    near: Sequence[np.ndarray | None],
-) -> _LawRows:
-    """windows: their number and periods. near: their starts by a law that is near, if known."""
-    rows, losses, starts = [], [], []
-    held = fits.relations.at(fits.points)
-    for k, (model, constraint, run) in enumerate(zip(fits.models, held, runs, strict=True)):
-        z = law @ at[k]
-        moved, _ = with_coef(model, constraint, constraint.coef(z))
-        slope, left, loss, own = _linearise(moved, constraint, run, windows, near[k])
-        rows.append((slope, slope @ z - left))
-        losses.append(loss)
-        starts.append(own)
-    return _LawRows(rows, float(np.mean(losses)), starts)
+    starts: Float[np.ndarray, "windows n_states"]
 
 
 def _linearise(
     model: SparseModel,
     held: Constraint,
     run: Trajectory,
-    windows: tuple[int, float],
+    z: Float[np.ndarray, " free"],
     near: Float[np.ndarray, "windows n_states"] | None,
-) -> tuple[Float[np.ndarray, "free free"], Float[np.ndarray, " free"], float, np.ndarray]:
-    """What windows leave, and its slopes by the free coefficients, starts eliminated.
+    *,
+    n_windows: int,
+    periods: float,
+) -> _WindowRows:
+    """What windows leave at the free coefficients z, and its slopes by them, starts eliminated.
 
-    Both are triangles of a QR decomposition, over the root of the number of residuals; then the
-    mean square of what is left, and the starts.
+    Both are triangles of a QR decomposition, over the root of the number of residuals.
+    near: starts of the windows by coefficients that are near, if known.
     """
-    along, (n_windows, periods) = Restarts(model, run, ACCURATE), windows
+    model, _ = with_coef(model, held, held.coef(z))
+    along = Restarts(model, run, ACCURATE)
     n_ahead = dominant_window([run], model.states, periods=periods) - 1
     first = along.starts(n_ahead, n_windows, measured=False)
     starts = along.fitted(first, n_ahead) if near is None else along.nearer(first, n_ahead, near)
@@ -124,7 +109,7 @@ def _linearise(
 
     left = off(along, starts)
     by_start = [(off(along, starts + MOVED * row) - left) / MOVED for row in np.diag(along.std)]
-    z, by_coef = read_coefficients(model, held)[held.free], []
+    by_coef = []
     for k, value in enumerate(z):
         step = MOVED * (abs(value) or 1.0)
         other, _ = with_coef(model, held, held.coef(z + step * (np.arange(len(z)) == k)))
@@ -133,12 +118,12 @@ def _linearise(
     moves = np.nan_to_num(np.array(by_start).transpose(1, 2, 0), nan=0.0)
     known = np.isfinite(left).all(axis=1) & np.isfinite(by_coef).all(axis=(0, 2))
     if not known.any():
-        return np.zeros((len(z), len(z))), np.zeros(len(z)), LOST, starts
+        return _WindowRows((np.zeros((len(z), len(z))), np.zeros(len(z))), LOST, starts)
     rows = np.concatenate([slopes, left[..., None]], axis=-1)[known]
     basis, _ = np.linalg.qr(moves[known])
     rows = (rows - basis @ (basis.transpose(0, 2, 1) @ rows)).reshape(-1, len(z) + 1)
     loss = float(np.square(rows[:, -1]).mean())
     _, triangle = np.linalg.qr(rows / np.sqrt(len(rows)))
     share = float(known.mean())
-    loss = share * loss + (1.0 - share) * LOST
-    return triangle[: len(z), :-1], triangle[: len(z), -1], loss, starts
+    R, left = triangle[: len(z), :-1], triangle[: len(z), -1]
+    return _WindowRows((R, R @ z - left), share * loss + (1.0 - share) * LOST, starts)

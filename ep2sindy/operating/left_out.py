@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from math import isfinite
@@ -35,13 +36,15 @@ N_WINDOWS = 20  # of every record that is left out
 # between the records: else their frequencies and amplitudes are better interpolated.
 TRUSTED = 0.75
 
-HOLDS = 0.9  # part of its own records at which a law must hold, to be preferred to one that fails
+MOST = 0.9  # part of its own records at which a law must hold, to be preferred to one that fails
 
 LONG, N_SAMPLES = 100.0, 2000  # periods and samples of a run at a quiet point
 
 ALIKE = 0.1  # laws whose runs deviate by less, in units of their bounds, count as equally good
 
 WORST = 5.0  # deviation, in units of its bound, of a run that does not hold
+
+UNKNOWN = {"frequency": float("nan"), "amplitude": float("nan")}  # errors of no interpolation
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +58,7 @@ class LeftOutRun:
     record: OperatingRecord
     run: Evaluation
     inside: bool
-    interpolated: Mapping[str, float] = field(default_factory=dict)
+    interpolated: Mapping[str, float] = field(default_factory=UNKNOWN.copy)
 
     @property
     def amplitude_error(self) -> float:
@@ -123,33 +126,39 @@ class LawTrial:
     @cached_property
     def fitted(self) -> list[Evaluation]:
         """The law of all points over each of its records."""
-        at = [(record, read_law(self.law, record.parameters)) for record in self.records]
-        return [run_freely(model, record, self.assessed) for record, model in at]
-
-    @cached_property
-    def held(self) -> float:
-        """Part of the records that the law was fitted to on which it stays, no more than HOLDS.
-
-        It is not asked of a model that inputs drive.
-        """
-        if self.fits.models[0].inputs:
-            return HOLDS
-        return min(HOLDS, sum(map(_stays, self.fitted)) / len(self.records))
+        models = [read_law(self.law, record.parameters) for record in self.records]
+        return self.run_with(models)
 
     @property
-    def is_sustained(self) -> bool:
-        """Whether the law holds at most of its records, where its cycles have to attract, too."""
-        return sum(run.holds for run in self.fitted) >= HOLDS * len(self.records)
+    def is_driven(self) -> bool:
+        """Whether inputs drive the model, which is then judged by windows and not by free runs."""
+        return bool(self.fits.models[0].inputs)
+
+    @cached_property
+    def share_on_cycle(self) -> float:
+        """Part of the records that the law was fitted to on which it stays, no more than MOST."""
+        if self.is_driven:
+            return MOST
+        return min(MOST, sum(map(_stays, self.fitted)) / len(self.records))
+
+    @property
+    def attracts(self) -> bool:
+        """Whether the law holds at MOST of its records, where its cycles have to attract, too."""
+        return sum(run.holds for run in self.fitted) >= MOST * len(self.records)
 
     @cached_property
     def left_out(self) -> list[LeftOutRun]:
         """Every record run freely with the law of the others."""
-        runs = []
-        for k, record in enumerate(self.records):
-            law = self.fits.law_without(k, self.functions)
-            run = run_freely(read_law(law, record.parameters), record, self.assessed)
-            runs.append(LeftOutRun(record, run, law.is_inside(record.parameters)))
-        return runs
+        points = [record.parameters for record in self.records]
+        laws = [self.fits.law_without(k, self.functions) for k in range(len(points))]
+        runs = self.run_with(list(map(read_law, laws, points)))
+        inside = map(OperatingLaw.is_inside, laws, points)
+        return list(map(LeftOutRun, self.records, runs, inside))
+
+    def run_with(self, models: Sequence[SparseModel]) -> list[Evaluation]:
+        """Every record run freely with a model of its own."""
+        pairs = zip(models, self.records, strict=True)
+        return [run_freely(model, record, self.assessed) for model, record in pairs]
 
     @cached_property
     def rests(self) -> list[bool]:
@@ -179,15 +188,14 @@ def follow_together(
     Raises ValueError if the points do not suffice for any law.
     """
     trials, runs = [], [record.run for record in start.records]
-    if not start.fits.models[0].inputs:
-        pairs = zip(start.fits.models, start.records, strict=True)
-        alone = [_stays(run_freely(model, record, start.assessed)) for model, record in pairs]
+    if not start.is_driven:
+        alone = [_stays(run) for run in start.run_with(start.fits.models)]
         if 2 * sum(alone) <= len(alone):
             return [start]
     for functions in start.fits.candidates(law):
         together = follow_windows(start.fits, functions, runs, n_windows=n_windows, periods=periods)
         trials.append(replace(start, fits=together, functions=functions))
-        if trials[-1].held == HOLDS:
+        if trials[-1].share_on_cycle == MOST:
             break
     return trials
 
@@ -202,11 +210,9 @@ def leave_out(
     """The trials with their errors at points left out, of those whose points suffice for it."""
     tested = []
     for trial in trials:
-        try:
+        with suppress(ValueError):  # too few points, or one that is indispensable
             trial.fits.rate_errors(trial.functions)
             tested.append(trial)
-        except ValueError:  # too few points, or one that is indispensable
-            continue
     if not tested:
         return list(trials)
     records = tested[0].records
@@ -320,10 +326,14 @@ class LawChoice:
         return [run for run in self.runs if run.inside] or list(self.runs)
 
     @property
+    def n_held(self) -> int:
+        """Number of the runs `inside` at which the law of the others holds."""
+        return sum(run.run.holds for run in self.inside)
+
+    @property
     def is_trusted(self) -> bool:
         """Whether the laws of the other points hold at most points left out between these."""
-        n_held = sum(run.run.holds for run in self.inside)
-        return bool(self.inside) and n_held >= TRUSTED * len(self.inside)
+        return bool(self.inside) and self.n_held >= TRUSTED * len(self.inside)
 
     @cached_property
     def statistics(self) -> dict[str, float | int]:
@@ -336,7 +346,7 @@ class LawChoice:
         """Whether the law holds between the records, or these are better interpolated."""
         if not self.runs:
             return ""
-        n, n_held = len(self.inside), sum(run.run.holds for run in self.inside)
+        n, n_held = len(self.inside), self.n_held
         where = "points left out" if self.inside[0].inside else "points beyond the others"
         if self.is_trusted:
             return f"holds at {n_held} of {n} {where}"
@@ -350,8 +360,8 @@ class LawChoice:
         once = "Left out one at a time, "
         if not self.runs:
             return f"{once}{self._windows_text}." if len(self.choice.errors) else ""
-        found, n, n_held = self.statistics, len(self.inside), sum(r.run.holds for r in self.inside)
-        where = " that the others enclose" if self.inside[0].inside else ""
+        found, where = self.statistics, " that the others enclose" if self.inside[0].inside else ""
+        n, n_held = len(self.inside), self.n_held
         said = f"{once}the law of the others holds at {n_held} of {n} points{where}"
         if isfinite(found["f_enclosed"]):
             said += f" and errs there by {_percent(found, 'enclosed')} in the median"
@@ -379,22 +389,24 @@ def choose_law(trials: Sequence[LawTrial]) -> LawChoice:
     Of those that deviate by less than ALIKE there the one of fewest numbers is taken. Laws that
     hold at the records that they were fitted to come before others. Of models that inputs drive, it
     is the law of fewest numbers among those that err least over windows left out.
-    trials: as `leave_out` returns them; without errors the last one is taken.
+    trials: as `leave_out` returns them; without errors, the first law that stays on most records
+    is taken, of refined fits before others.
     """
     one, tested = trials[0], [trial for trial in trials if len(trial.errors)]
     states = one.assessed or one.fits.models[0].states
     between = Interpolation.best(usual_functions(one.fits.parameters), one.records, states)
     if not tested:
-        return LawChoice(trials, trials[-1], [], between)
-    if one.fits.models[0].inputs:
+        best = max(trials, key=lambda trial: (trial.share_on_cycle, bool(trial.fits.statuses)))
+        return LawChoice(trials, best, [], between)
+    if one.is_driven:
         place = fewest_of_least([(trial.errors, trial.n_numbers) for trial in tested])
         return LawChoice(trials, tested[place], [], between)
-    most = max(trial.held for trial in tested)
-    stay = [trial for trial in tested if trial.held == most]
+    most = max(trial.share_on_cycle for trial in tested)
+    stay = [trial for trial in tested if trial.share_on_cycle == most]
 
     def rank(trial: LawTrial) -> tuple[float, ...]:
         score, error = max(trial.score, ALIKE), max(trial.error, ACCURATE)
-        return (not trial.is_sustained, score, trial.n_numbers, error)
+        return (not trial.attracts, score, trial.n_numbers, error)
 
     best = min(stay, key=rank)
     return LawChoice(trials, best, _beside(best.left_out, between), between)
@@ -402,16 +414,11 @@ def choose_law(trials: Sequence[LawTrial]) -> LawChoice:
 
 def _beside(runs: Sequence[LeftOutRun], between: Interpolation | None) -> list[LeftOutRun]:
     """The runs with the errors of interpolation, where the other points enclose theirs."""
-    nothing = np.full((len(runs), 2), np.nan)
-    errors = (
-        nothing
-        if between is None
-        else np.where([[r.inside] for r in runs], between.errors, nothing)
-    )
-    names = ("frequency", "amplitude")
+    if between is None:
+        return list(runs)
     return [
-        replace(run, interpolated=dict(zip(names, own.tolist(), strict=True)))
-        for run, own in zip(runs, errors, strict=True)
+        replace(run, interpolated=dict(zip(UNKNOWN, own, strict=True))) if run.inside else run
+        for run, own in zip(runs, between.errors.tolist(), strict=True)
     ]
 
 

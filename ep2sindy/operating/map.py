@@ -16,7 +16,7 @@ from ep2sindy.model.model import SparseModel
 from ep2sindy.model.rollout import simulate
 from ep2sindy.model.stability import limit_cycle
 from ep2sindy.operating.law import OperatingLaw, read_law
-from ep2sindy.operating.records import OperatingRecord, Point, read_points
+from ep2sindy.operating.records import OperatingRecord, Point, values_at
 from ep2sindy.signals.spectrum import SIMULATED, relative_amplitude
 
 # Least decay rate per period of a fixed point at which a diverging run counts as resting: e-fold in
@@ -73,11 +73,8 @@ def map_points(points: Sequence[Point], n: int) -> list[dict[str, float]]:
     names = list(points[0])
     if len(names) > MAX_PARAMETERS:
         return []
-    values = np.array([[point[name] for name in names] for point in points])
-    axes = [
-        np.linspace(low, high, n).tolist()
-        for low, high in zip(values.min(axis=0), values.max(axis=0), strict=True)
-    ]
+    values = values_at(points, names)
+    axes = np.linspace(values.min(axis=0), values.max(axis=0), n).T.tolist()
     return [dict(zip(names, each, strict=True)) for each in product(*axes)]
 
 
@@ -85,32 +82,29 @@ def law_map(
     law: OperatingLaw, records: Sequence[OperatingRecord], points: Sequence[Point]
 ) -> list[MapPoint]:
     """The law's models at given operating points, each started from the nearest record."""
-    values = read_points([law.own(r.parameters) for r in records], law.parameters)
-    scale = zero_to_one(np.ptp(values, axis=0))
-    found = []
-    for point in points:
-        at = np.array([point[name] for name in law.parameters])
-        nearest = int(np.argmin(np.linalg.norm((values - at) / scale, axis=1)))
-        found.append(_map_point(law, records[nearest], point))
-    return found
+    known = values_at([record.parameters for record in records], law.parameters)
+    off = (values_at(points, law.parameters)[:, None] - known) / zero_to_one(np.ptp(known, axis=0))
+    nearest = np.linalg.norm(off, axis=-1).argmin(axis=1)
+    return [_map_point(law, records[k], at) for k, at in zip(nearest, points, strict=True)]
 
 
 def _map_point(law: OperatingLaw, record: OperatingRecord, point: Point) -> MapPoint:
-    model = read_law(law, point)
-    period_s = 1.0 / record.cycle.frequency_Hz
-    start = record.run.states[record.slowest]
-    mean, frequency_Hz, amplitude, second = record.cycle.mean, np.nan, np.nan, np.nan
-    status, late = _run(model, start, record)
+    model, period_s = read_law(law, point), 1.0 / record.cycle.frequency_Hz
+    status, late = _run(model, record)
+    mean, (frequency_Hz, amplitude, second) = record.cycle.mean, (np.nan, np.nan, np.nan)
     if status is Status.SUSTAINED:
         cycle = limit_cycle(model, late, period_s=period_s)
-        if cycle is None or cycle.stability == "repelling":
-            status = Status.DECAYS if cycle is None else Status.DIVERGES
+        if cycle is None:
+            status = Status.DECAYS
+        elif cycle.stability == "repelling":
+            status = Status.DIVERGES
         else:
             mean = cycle.states.mean(axis=0)
-            frequency_Hz = 1.0 / cycle.period_s
-            amplitude = relative_amplitude(mean, cycle.states.std(axis=0))
-            second = cycle.largest_multiplier
-            status = Status.SUSTAINED if _moves(cycle.states, record) else Status.DECAYS
+            if _moves(cycle.states, record):
+                amplitude = relative_amplitude(mean, cycle.states.std(axis=0))
+                frequency_Hz, second = 1.0 / cycle.period_s, cycle.largest_multiplier
+            else:
+                status = Status.DECAYS
     elif status is Status.DECAYS:
         mean = late
     rest = rest_point(model, mean, record.cycle.std, record.run.states.min(axis=0) > 0.0)
@@ -130,10 +124,10 @@ def _map_point(law: OperatingLaw, record: OperatingRecord, point: Point) -> MapP
 
 
 def _run(
-    model: SparseModel, start: Float[np.ndarray, " n_states"], record: OperatingRecord
+    model: SparseModel, record: OperatingRecord
 ) -> tuple[Status, Float[np.ndarray, " n_states"]]:
-    """Status of a run from a start, next to the record, and its final state."""
-    n, reach = 50, np.abs(record.run.states).max(axis=0)
+    """Status of a run from the record's slowest sample, and its final state."""
+    start, n, reach = record.run.states[record.slowest], 50, np.abs(record.run.states).max(axis=0)
     t = np.linspace(0.0, N_PERIODS / record.cycle.frequency_Hz, N_PERIODS * n + 1)
     run = simulate(model, t, start, None, blow_up=1e3, rtol=1e-7, reach=reach)
     if run.diverged or not np.isfinite(run.states).all():

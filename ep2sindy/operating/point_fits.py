@@ -21,13 +21,14 @@ from ep2sindy.operating.law import LawConstraint, LawFunctions, OperatingLaw, ma
 from ep2sindy.operating.quiet import QuietPoint, pool_quiet
 from ep2sindy.refinement.assess import RefinementStatus
 from ep2sindy.refinement.problem import RefinementSettings
-from ep2sindy.refinement.refine import refine
+from ep2sindy.refinement.refine import Refinement, refine
 from ep2sindy.regression.constrained import (
     ConstrainedSolution,
     read_coefficients,
     solve_constrained,
 )
 from ep2sindy.regression.pooled import (
+    Rows,
     fewest_of_least,
     invert_covariance,
     residuals_left_out,
@@ -79,7 +80,7 @@ class PointFits:
     how: str
     statuses: Sequence[str] = ()
     losses: Sequence[float] = ()
-    rows: Sequence[tuple[Float[np.ndarray, "free free"], Float[np.ndarray, " free"]]] | None = None
+    rows: Rows | None = None
     quiet: Sequence[QuietPoint] = ()
 
     @property
@@ -106,8 +107,13 @@ class PointFits:
             return [polynomial(list(self.parameters), degree=law)]
         if isinstance(law, Library):
             return [law]
-        several = usual_functions(self.parameters) if isinstance(law, str) else law
-        tested, reasons = self.test_laws(several)
+        tested, reasons = [], []
+        for one in usual_functions(self.parameters) if isinstance(law, str) else law:
+            try:
+                functions = self.functions(one)
+                tested.append((functions, self.rate_errors(functions)))
+            except ValueError as error:  # too few points
+                reasons.append(str(error))
         if not tested:
             raise ValueError([*reasons, "law=[...] must name degrees or functions"][0])
         place = fewest_of_least([(errors, len(own)) for own, errors in tested])
@@ -120,19 +126,6 @@ class PointFits:
     def functions(self, law: LawFunctions | Sequence[LawFunctions]) -> Library:
         """The likeliest functions of a law; see `candidates`."""
         return self.candidates(law)[0]
-
-    def test_laws(
-        self, laws: Sequence[LawFunctions]
-    ) -> tuple[list[tuple[Library, Float[np.ndarray, " points"]]], list[str]]:
-        """The functions and `rate_errors` of each law, and why other laws have too few points."""
-        tested, reasons = [], []
-        for law in laws:
-            try:
-                functions = self.functions(law)
-                tested.append((functions, self.rate_errors(functions)))
-            except ValueError as error:
-                reasons.append(str(error))
-        return tested, reasons
 
     def columns(self, functions: Library) -> Float[np.ndarray, "points variables"]:
         """The parameters of the points in the order of the functions' variables."""
@@ -148,24 +141,20 @@ class PointFits:
         if the points do not suffice for a law without each of them.
         Source: Efron & Stein 1981, doi:10.1214/aos/1176345462, for the jackknife.
         """
-        free, covariance, errors = self.pool(functions), None, None
+        law, n = self.law_without(None, functions), len(self.models)
         with suppress(ValueError):  # too few points to leave one out
             errors = self.rate_errors(functions)
-            laws = np.stack([self.pool(functions, without=k) for k in range(len(self.models))])
-            apart = (laws - laws.mean(axis=0)).reshape(len(laws), -1)
-            covariance = (len(laws) - 1) / len(laws) * apart.T @ apart
-        columns = self.columns(functions)
-        return self.relations.make_law(
-            self.models[0], functions, columns, free, covariance, self.how, errors
-        )
+            apart = np.stack([self.law_without(k, functions).coef.ravel() for k in range(n)])
+            apart -= apart[0]  # so that what is known is known exactly
+            apart -= apart.mean(axis=0)
+            law = replace(law, covariance=(n - 1) / n * apart.T @ apart, left_out=errors)
+        return law
 
-    def law_without(self, number: int, functions: Library) -> OperatingLaw:
-        """The law of all points but one, without covariance."""
-        columns = np.delete(self.columns(functions), number, axis=0)
-        free = self.pool(functions, without=number)
-        return self.relations.make_law(
-            self.models[0], functions, columns, free, None, self.how, None
-        )
+    def law_without(self, number: int | None, functions: Library) -> OperatingLaw:
+        """The law of all points but one, or of all, without covariance."""
+        free, points = self.pool(functions, without=number), self.columns(functions)
+        points = points if number is None else np.delete(points, number, axis=0)
+        return self.relations.make_law(self.models[0], functions, points, free, how=self.how)
 
     def rate_errors(self, functions: Library) -> Float[np.ndarray, " points"]:
         """Error at each point of the law of the others, as a fraction of the point's rates.
@@ -203,10 +192,10 @@ class PointFits:
         return zero_to_one(np.sqrt(np.square(self.coefficients).mean(axis=0)))
 
     @cached_property
-    def _rows(self) -> list[tuple[Float[np.ndarray, "free free"], Float[np.ndarray, " free"]]]:
+    def _rows(self) -> Rows:
         """For each point, rows R and R z with R^T R its scaled information; or those given."""
         if self.rows is not None:
-            return list(self.rows)
+            return self.rows
         scale = np.outer(self.size, self.size)
         roots = [root_of(own * scale) / self.size for own in self.information]
         return [(root, root @ own) for root, own in zip(roots, self.coefficients, strict=True)]
@@ -283,53 +272,49 @@ def fit_trajectories(
     refinement begins with the point's own. The result of a point does not depend on the others.
     """
     held = [start.relations.at(start.points) for start in starts]
+    begun = [start.models for start in starts] if first is None else first
     streams = np.random.default_rng(seed).spawn(len(runs))
     pieces = [
-        (
-            list(own),
-            [
-                (start.models[k] if first is None else first[n][k], start.models[k], held[n][k])
-                for n, start in enumerate(starts)
-            ],
-            streams[k],
-        )
+        (own, streams[k], [
+            (models[k], start.models[k], constraints[k])
+            for models, start, constraints in zip(begun, starts, held, strict=True)
+        ])
         for k, own in enumerate(runs)
-    ]
+    ]  # fmt: skip
     stage = progress.stage(len(pieces), "point", "refinement")
     found = collect(workers, partial(_refine_point, settings=settings), pieces, stage)
-    return [
-        replace(
-            start,
-            models=[at[n].model for at in found],
-            information=np.array([information_of(at[n], start.relations.common) for at in found]),
-            how="trajectories",
-            statuses=[str(at[n].status) for at in found],
-            losses=[at[n].loss for at in found],
-        )
-        for n, start in enumerate(starts)
-    ]
+    refined = []
+    for start, at_points in zip(starts, zip(*found, strict=True), strict=True):
+        models, statuses, losses, information = zip(*at_points, strict=True)
+        own = replace(start, models=models, statuses=statuses, losses=losses)
+        refined.append(replace(own, information=np.array(information), how="trajectories"))
+    return refined
 
 
 Start = tuple[SparseModel, SparseModel, Constraint]  # the model to begin with, and the one of rows
+# What is kept of a refinement, without the windows that it followed: the model, status, loss, and
+# the information on the free coefficients.
+Refined = tuple[SparseModel, str, float, Float[np.ndarray, "free free"]]
 
 
 def _refine_point(
-    piece: tuple[Sequence[Trajectory], Sequence[Start], np.random.Generator],
+    piece: tuple[Sequence[Trajectory], np.random.Generator, Sequence[Start]],
     *,
     settings: RefinementSettings,
-) -> list[_Refined]:
+) -> list[Refined]:
     """Every structure refined on the runs of one point."""
-    runs, starts, rng = piece
+    runs, rng, starts = piece
 
-    def refined(models: Sequence[SparseModel], held: Sequence[Constraint]) -> list[_Refined]:
+    def refined(models: Sequence[SparseModel], held: Sequence[Constraint]) -> list[Refined]:
         found = refine(models, [runs] * len(models), settings, constraints=held, seed=rng)
-        return [_Refined(f.model, f.status, f.loss, f.covariance_naive) for f in found]
+        return [
+            (fit.model, str(fit.status), fit.loss, _information(fit, own))
+            for fit, own in zip(found, held, strict=True)
+        ]
 
     found = refined([first for first, _, _ in starts], [held for *_, held in starts])
     again = [
-        k
-        for k, (first, own, _) in enumerate(starts)
-        if found[k].status in FAILED and first is not own
+        k for k, (first, own, _) in enumerate(starts) if found[k][1] in FAILED and first is not own
     ]
     if again:
         second = refined([starts[k][1] for k in again], [starts[k][2] for k in again])
@@ -338,22 +323,11 @@ def _refine_point(
     return found
 
 
-@dataclass(frozen=True, eq=False)
-class _Refined:
-    """What is kept of a refinement: without the windows that it followed."""
-
-    model: SparseModel
-    status: RefinementStatus
-    loss: float
-    covariance_naive: Float[np.ndarray, "_ _"] | None
-
-
-def information_of(fit: _Refined, common: Constraint) -> Float[np.ndarray, "free free"]:
+def _information(fit: Refinement, held: Constraint) -> Float[np.ndarray, "free free"]:
     """Inverse covariance of the free coefficients; zero if the refinement did not converge."""
-    free = common.free
-    if fit.covariance_naive is None or fit.status in FAILED:
-        return np.zeros((len(free), len(free)))
-    covariance = np.zeros((len(common.coefficients), len(common.coefficients)))
-    moved = np.flatnonzero(read_coefficients(fit.model, common))
-    covariance[np.ix_(moved, moved)] = fit.covariance_naive
+    n, free = len(held.coefficients), held.free
+    covariance = np.zeros((n, n))
+    if fit.covariance_naive is not None and fit.status not in FAILED:
+        moved = np.flatnonzero(read_coefficients(fit.model, held))
+        covariance[np.ix_(moved, moved)] = fit.covariance_naive
     return invert_covariance(covariance[np.ix_(free, free)])

@@ -19,13 +19,14 @@ from ep2sindy.model.model import SparseModel
 from ep2sindy.model.scores import r2
 from ep2sindy.operating.records import check_varying
 from ep2sindy.regression.pooled import Basis, fewest_of_least
-from ep2sindy.runtime.values import check_count, read_only
+from ep2sindy.runtime.values import read_only
 
 LEVEL = 0.95  # level of all intervals in this file
 
 # Fraction of the values' RMS: errors below it are rounding, and the law with fewer terms wins.
 ROUNDING = 1e-10
 
+LEAST_POINTS = 3  # of a control law
 POINTS_PER_TERM = 3  # points for each term of a control law: with fewer, a search fits their errors
 
 
@@ -166,11 +167,12 @@ def fit_control_law(
     Assumes errors of equal variance at all points.
     max_terms: None allows one term for every three points; never more than leave two points over,
     nor more than the library has. A support to which one point is indispensable is left out.
-    Raises ValueError for under three points, another number of parameters than variables, values
-    that are not finite, or a parameter that never varies.
+    Raises ValueError for under three points, or a parameter that never varies.
     Source: Allen 1974, doi:10.1080/00401706.1974.10489157.
     """
-    _check(values, parameters, library, max_terms)
+    if len(values) < LEAST_POINTS:
+        raise ValueError(f"a law needs three points or more, got {len(values)}")
+    check_varying(parameters, library.variables, remedy="leave it out of the library")
     theta = library.evaluate(parameters)
     max_terms = max_terms or max(1, len(values) // POINTS_PER_TERM)
     support, coef, left_out = _search(values, theta, max_terms)
@@ -187,23 +189,6 @@ def fit_control_law(
         loo_error=_relative(values - left_out, values),
         search_error=_relative(values - searched, values),
     )
-
-
-def _check(
-    values: np.ndarray, parameters: np.ndarray, library: Library, max_terms: int | None
-) -> None:
-    names = list(library.variables)
-    if len(values) < 3:
-        raise ValueError(f"a law needs three points or more, got {len(values)}")
-    if parameters.shape[1] != len(names):
-        raise ValueError(
-            f"parameters must have one column for each of {names}, got {parameters.shape[1]}"
-        )
-    if not (np.isfinite(values).all() and np.isfinite(parameters).all()):
-        raise ValueError("values and parameters must be finite: leave out points that are not")
-    check_varying(parameters, names, remedy="leave it out of the library")
-    if max_terms is not None:
-        check_count("max_terms", max_terms)
 
 
 def _search(

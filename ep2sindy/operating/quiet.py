@@ -15,7 +15,7 @@ from ep2sindy.library.library import Library
 from ep2sindy.model.fixed_point import NEAR, RESTING
 from ep2sindy.operating.law import LawConstraint
 from ep2sindy.operating.map import NEUTRAL
-from ep2sindy.operating.records import Point, read_points
+from ep2sindy.operating.records import Point, values_at
 from ep2sindy.regression.pooled import Basis, Rows, pool_rows, pool_within
 from ep2sindy.runtime.values import Samples, check_positive, read_only
 from ep2sindy.signals.attractor import find_cycle, noise_std
@@ -161,11 +161,8 @@ class RestingModel:
     def of(
         point: QuietPoint, functions: Library, relations: LawConstraint, library: Library
     ) -> RestingModel:
-        def of_point(variables: Sequence[str]) -> np.ndarray:
-            return read_points([{v: point.parameters[v] for v in variables}], variables)
-
-        common = relations.common
-        (held,) = relations.at(of_point(relations.functions.variables))
+        common, at = relations.common, [point.parameters]
+        (held,) = relations.at(values_at(at, relations.functions.variables))
         index = [library.index(term) for _, term in common.coefficients]
         used, terms = np.unique(index, return_inverse=True)
         return RestingModel(
@@ -175,7 +172,7 @@ class RestingModel:
             equations=np.array([common.states.index(state) for state, _ in common.coefficients]),
             C=common.C,
             d=held.d,
-            functions=functions.evaluate(of_point(functions.variables))[0],
+            functions=functions.evaluate(values_at(at, functions.variables))[0],
         )
 
     def limits(

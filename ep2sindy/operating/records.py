@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -98,10 +98,8 @@ class OperatingRecord:
 
     @property
     def from_slowest(self) -> Trajectory:
-        """The record from its slowest sample on; all of it, if it repeats no cycle."""
-        with suppress(ValueError):
-            return self.run.window(self.slowest, self.run.n_samples)
-        return self.run
+        """The record from its slowest sample on. Raises ValueError if it repeats no cycle."""
+        return self.run.window(self.slowest, self.run.n_samples)
 
 
 @contextmanager
@@ -171,6 +169,13 @@ def read_points(
     return np.array([[float(point[name]) for name in names] for point in points])
 
 
+def values_at(
+    points: Sequence[Point], names: Sequence[str]
+) -> Float[np.ndarray, "points parameters"]:
+    """Values of some parameters of points that may have more, a column for each name."""
+    return read_points([{name: point[name] for name in names} for point in points], names)
+
+
 def values_of(points: Mapping[str, Sequence[Trajectory]]) -> Float[np.ndarray, "points parameters"]:
     """Parameters of all points. Raises ValueError for runs without parameters."""
     first = [runs[0].parameters for runs in points.values()]
@@ -213,17 +218,15 @@ def branches_of(records: Sequence[OperatingRecord]) -> Int[np.ndarray, " records
     left = _off_plane(values, amplitude)
     order = np.argsort(left)
     gaps = np.diff(left[order])
-    nothing = np.zeros(len(records), dtype=np.int64)
-    if len(records) < FEW or not gaps.size:
-        return nothing
+    found = np.zeros(len(records), dtype=np.int64)
+    if len(records) < FEW:
+        return found
     k = int(np.argmax(gaps))
     weak, strong = order[: k + 1], order[k + 1 :]
     inner = [np.ptp(left[group]) / len(group) for group in (weak, strong) if len(group) > FEW]
     spread = max(inner, default=np.inf)
-    if not (gaps[k] > MIN_STEP and gaps[k] > APART * spread):
-        return nothing
-    found = nothing.copy()
-    found[weak] = 1
+    if gaps[k] > MIN_STEP and gaps[k] > APART * spread:
+        found[weak] = 1
     return found
 
 

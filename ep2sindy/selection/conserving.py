@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -21,7 +22,7 @@ from ep2sindy.regression.searches import BestSubset, Search
 from ep2sindy.selection.systems import Systems, TrialSystem, find_broken_demands
 
 Asked = tuple[DiscoveryProblem, Sequence[RegressionRows]]  # the runs of a point, and their rows
-Support = Int[np.ndarray, " _"]  # indices of processes
+Chosen = Bool[np.ndarray, " processes"]
 
 
 def search_conserving_systems(
@@ -48,6 +49,7 @@ def search_conserving_systems(
     processes = joined[0].processes
     masks = _propose(joined, search)
     complete = _keep_complete(masks, processes, joined[0].roles.names)
+    # By point, support and process, of columns of unit norm.
     coef = np.array([fit_masks(rows.xx, rows.xy, complete) for rows in joined])
     left = [1.0 - each @ rows.xy / rows.yy for each, rows in zip(coef, joined, strict=True)]
     errors = np.log(np.maximum(left, ROUNDING)).mean(axis=0)
@@ -57,25 +59,20 @@ def search_conserving_systems(
     admissible = [
         k
         for k in independent
-        if not any(
-            rows.broken(np.flatnonzero(complete[k]), own[k, complete[k]])
-            for rows, own in zip(joined, coef, strict=True)
-        )
+        if not any(rows.broken(complete[k], own[k]) for rows, own in zip(joined, coef, strict=True))
     ]
     kept = _keep_first(admissible or independent.tolist(), complete.sum(axis=1), depth)
-    found = [
-        [rows.system(np.flatnonzero(complete[k]), own[k, complete[k]]) for k in kept]
+    systems = [
+        [system for k in kept if (system := rows.system(complete[k], own[k])) is not None]
         for rows, own in zip(joined, coef, strict=True)
     ]
-    # Those whose coefficients tell the processes apart.
-    told = [[system for system in each if system is not None] for each in found]
-    if not told[0]:
+    if not systems[0]:
         raise ValueError(
             f"no system of up to {masks.sum(axis=1).max(initial=0)} terms plays all of the roles "
             f"{list(dict.fromkeys(process.role for process in processes))}: raise the search's "
             "max_terms or n_best, or give fewer roles"
         )
-    pairs = zip(told, joined, strict=True)
+    pairs = zip(systems, joined, strict=True)
     return [_add_fronts(own, rows.problems, rows.task) for own, rows in pairs]
 
 
@@ -111,24 +108,21 @@ class _JoinedRows:
         products = unit.T @ unit, unit.T @ target, float(target @ target)
         return _JoinedRows(task, problems, roles, processes, norms, *products, means)
 
-    def broken(self, chosen: Support, values: Float[np.ndarray, " _"]) -> list[str]:
-        """The demands that these processes do not meet. values: by columns of unit norm."""
-        means = None if self.means is None else self.means[chosen]
-        own = [self.processes[k] for k in chosen]
-        return find_broken_demands(own, values / self.norms[chosen], means)
+    def broken(self, mask: Chosen, coef: Float[np.ndarray, " processes"]) -> list[str]:
+        """The demands that the chosen processes do not meet. coef: by columns of unit norm."""
+        means = None if self.means is None else self.means[mask]
+        own = list(compress(self.processes, mask))
+        return find_broken_demands(own, (coef / self.norms)[mask], means)
 
-    def system(self, chosen: Support, values: Float[np.ndarray, " _"]) -> TrialSystem | None:
+    def system(self, mask: Chosen, coef: Float[np.ndarray, " processes"]) -> TrialSystem | None:
         """The system of these processes; None if its coefficients do not tell them apart."""
-        library, roles = self.task.library, self.roles
-        own = [self.processes[k] for k in chosen]
-        held = constraint_of(library, self.task.states, own, roles.known_processes)
+        task, roles, own = self.task, self.roles, list(compress(self.processes, mask))
+        held = constraint_of(task.library, task.states, own, roles.known_processes)
         if held is None:
             return None
         fixed = np.array([roles.known.get(held.coefficients[k], 0.0) for k in held.free])
-        free = process_matrix(held) @ (values / self.norms[chosen]) + fixed
-        return TrialSystem.of(
-            self.task, held, free, None if self.means is None else self.means[chosen]
-        )
+        free = process_matrix(held) @ (coef / self.norms)[mask] + fixed
+        return TrialSystem.of(task, held, free, None if self.means is None else self.means[mask])
 
 
 def _propose(joined: Sequence[_JoinedRows], search: Search) -> Bool[np.ndarray, "_ processes"]:
@@ -136,10 +130,7 @@ def _propose(joined: Sequence[_JoinedRows], search: Search) -> Bool[np.ndarray, 
     if len(joined) == 1:
         (one,) = joined
         return search.supports(one.xx, one.xy, one.yy)
-    if not isinstance(search, BestSubset):
-        raise ValueError(
-            f"a search of several points must weigh them at once: {search} cannot; use BestSubset"
-        )
+    assert isinstance(search, BestSubset)  # `check_shared` refuses others
     xx, xy, yy = (np.array([getattr(rows, key) for rows in joined]) for key in ("xx", "xy", "yy"))
     return search.shared_supports(xx, xy, yy)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -92,8 +93,7 @@ def point_processes(choice: LawChoice, zones: Mapping[str, Zones]) -> list[Point
 
     zones: what the record of each point tells, by its label; a point that is absent tells nothing.
     """
-    trial, found = choice.choice, []
-    fits = trial.fits
+    trial, fits, found = choice.choice, choice.choice.fits, []
     if not fits.relations.common.processes:
         return []
     pairs = zip(choice.records, fits.relations.at(fits.points), strict=True)
@@ -145,7 +145,7 @@ def add_processes(
 def _metrics(parameters: Sequence[str]) -> list[Metric[PointProcess]]:
     return [
         Metric("process", lambda each: each.process.name, View.SHOWN),
-        *map(_parameter, parameters),
+        *map(of_parameter, parameters),
         Metric("modelled", lambda each: each.modelled, View.SHOWN, "by the law"),
         Metric("reach", lambda each: each.reach, View.SHOWN, "±"),
         Metric("recorded", lambda each: each.recorded, View.SHOWN, "in the record"),
@@ -156,7 +156,8 @@ def _metrics(parameters: Sequence[str]) -> list[Metric[PointProcess]]:
     ]
 
 
-def _parameter(name: str) -> Metric[PointProcess]:
+def of_parameter(name: str) -> Metric[Any]:
+    """The value of a parameter at the point of a record."""
     return Metric(name, lambda each: each.record.parameters[name], View.SHOWN, name, "{:g}")
 
 

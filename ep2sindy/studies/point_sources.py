@@ -48,13 +48,16 @@ Functions = Annotated[
 class GivenPoints:
     """Operating points as they were given.
 
-    names: of the parameters. sources: of the data of every point. left_out: files that a pattern
-    nearly fits.
+    sources: of the data of every point. left_out: files that a pattern nearly fits.
     """
 
-    names: list[str]
     sources: Sequence[PointSource]
     left_out: Sequence[str] = ()
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the parameters."""
+        return list(self.sources[0].parameters)
 
 
 def given_points(
@@ -69,11 +72,11 @@ def given_points(
     Raises ValueError for files or axes next to data that are not read from files, if no file fits,
     and for a parameter that a file does not state.
     """
-    names, settings = list(parameters), source.data.settings
+    settings = source.data.settings
     blocks = [each for each in points if isinstance(each, Mapping)]
     axes = blocks[0].get("axes", []) if blocks else []
     if blocks and not axes:
-        return GivenPoints(names, point_sources(source, parameters, expand(blocks, names)))
+        return GivenPoints(point_sources(source, parameters, expand(blocks, list(parameters))))
     if "path" not in settings:
         raise ValueError(
             f"points of files need data that are read from files: got {settings['_target_']} with "
@@ -83,12 +86,12 @@ def given_points(
     if axes:
         found = points_on_axes(settings["path"], axes, settings.get("units") or {})
         given = [{**point, "data": {"at": at}} for at, point in found]
-        return GivenPoints(axes, point_sources(source, dict.fromkeys(axes), given))
+        return GivenPoints(point_sources(source, dict.fromkeys(axes), given))
     files = points if isinstance(points, str) else [each for each in points if type(each) is str]
     asked = [name for name, place in parameters.items() if place is None]
     given, left_out = _of_files(files, asked, settings)
-    names = [name for name in given[0] if name != "data"]
-    return GivenPoints(names, point_sources(source, dict.fromkeys(names), given), left_out)
+    places = dict.fromkeys(name for name in given[0] if name != "data")
+    return GivenPoints(point_sources(source, places, given), left_out)
 
 
 def _of_files(

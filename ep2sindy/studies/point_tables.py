@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -19,6 +20,7 @@ from ep2sindy.operating.left_out import LawChoice, LawTrial, LeftOutRun
 from ep2sindy.operating.map import MapPoint
 from ep2sindy.operating.point_fits import FAILED
 from ep2sindy.operating.quantities import (
+    LEAST_POINTS,
     ControlLaw,
     Quantity,
     control_functions,
@@ -33,6 +35,7 @@ from ep2sindy.report.models import NO_ENDS, coefficients, equations, with_error
 from ep2sindy.report.report import Report
 from ep2sindy.report.results import Metric, Metrics, ResultTable, View, percent
 from ep2sindy.signals.spectrum import Oscillation, dominant_frequency
+from ep2sindy.studies.point_processes import of_parameter
 from ep2sindy.studies.point_sources import OpenedPoint
 from ep2sindy.studies.views import EVALUATION, terms_text
 
@@ -42,39 +45,30 @@ LAW_INTERVALS = (
     "coefficients are not exactly of this form."
 )
 LEFT_OUT = (
-    "Each point in turn read off the law of the others, and run freely from one sample of its "
-    "record, where the states move least. Errors are those against the record's cycle; a model "
-    "sustained, within 1 % of frequency, 10 % of amplitude and 0.2 standard "
-    "deviations of waveform; enclosed: whether the others enclose it. Interpolated: errors of "
-    "frequency and amplitude without a model, by the functions of the law fitted to those of the "
-    "other records; of enclosed points."
+    "The law of the other points, run freely from the slowest sample of each record, with errors "
+    "against the record's cycle. A model is sustained within 1 % of frequency, 10 % of amplitude "
+    "and 0.2 standard deviations of waveform. Enclosed: by the other points. Interpolated: errors "
+    "without a model, by functions fitted to frequencies and amplitudes of the other records."
 )
 TRIED = (
-    "error: mean over the points left out, by the law of the others, of what windows of the record "
-    "leave, in standard deviations of the states; nine in ten: of the points. It tells fits apart, "
-    "also if their coefficients have a bias that is as smooth as the truth. numbers: of the law. "
-    "Chosen: the fewest numbers within a standard error of the least, of models whose cycles "
-    "attract at points left out."
+    "error: what the law of the others leaves of windows at points left out, in standard "
+    "deviations of the states, in the mean and of nine in ten points. Chosen: of laws that stay on "
+    "most of their records, the one whose runs deviate least at points left out; of models that "
+    "inputs drive, the fewest numbers within a standard error of the least error."
 )
 CAPTIONS = {
-    "laws": "Coefficients over the operating parameters, with 95 % intervals: by the law that all "
-    "points share (lines, filled at its points) and refined at each point alone (open), at up to "
-    "five values of the other parameters. Where the open points leave the lines by more than their "
-    "bars, other coefficients make up for it: points are sloppy in some directions, and those "
-    "count little.",
+    "laws": "Coefficients over the operating parameters, with 95 % intervals, at up to five values "
+    "of the other parameters. Where open marks leave the lines by more than their bars, other "
+    "coefficients make up for it: records determine these directions poorly, so they count little.",
     "map": "Frequency and relative amplitude (standard deviation over mean, of states that do not "
-    "swing around zero) of the law's cycle over the operating parameters, none where it rests, and "
-    "of the records (circles); crosses: points that do not oscillate; diamonds: records of another "
-    "cycle, not fitted here. Red: the law oscillates where the record does not, or the reverse. "
-    "Black line on a map: where the law's cycle ends; dashed: where its fixed point turns stable, "
-    "of which cycles alone tell little. Faded: beyond what the points that the law was fitted to "
-    "enclose, where it is extrapolated.",
+    "swing around zero) of the law's cycle over the operating parameters, and of the records. Red: "
+    "the law oscillates where the record does not, or the reverse. Cycles alone tell little of "
+    "where the fixed point turns stable.",
 }
 # What a law's model does at a point without a record of its cycle.
 ALONE = {Status.SUSTAINED: "oscillates", Status.DECAYS: "rests", Status.DIVERGES: "diverges"}
 
 MOST_LAWS = 3  # on the screen
-LEAST_POINTS = 3  # of a control law
 
 INTERVALS = (
     "Intervals of 95 % are sandwiches: of least squares with blocks of two periods as clusters, of "
@@ -102,14 +96,14 @@ class PointsFound:
     """What a study of operating points has found.
 
     trials: every fit that was tried, by its model. choice: the law that is taken; None if the
-    points do not suffice for one. first: what was found for the first model, whose rows say how
-    well derivatives are fitted. maps: the law's models at all points that were opened, then over a
+    points do not suffice for one. by_model: what was found for each model, whose rows say how well
+    derivatives are fitted. maps: the law's models at all points that were opened, then over a
     grid; empty if the law has no free runs.
     """
 
     trials: Sequence[LawTrial]
     choice: LawChoice | None
-    first: Discovery
+    by_model: Mapping[str, Discovery]
     opened: Sequence[OpenedPoint]
     maps: Sequence[MapPoint] = ()
 
@@ -128,7 +122,8 @@ class PointsFound:
     @property
     def cycle(self) -> str:
         """Name of the cycle of the records that were fitted."""
-        return "all" if self.first.law_choice is None else self.first.law_choice.cycle
+        first = next(iter(self.by_model.values())).law_choice
+        return "all" if first is None else first.cycle
 
     def branch(self, point: OpenedPoint) -> str:
         """The cycle that a point's record is on; empty if it is on none."""
@@ -143,7 +138,8 @@ def points_table(opened: Sequence[OpenedPoint], found: PointsFound | None = None
     """One row per operating point: status of its record, its cycle, and what the law does there."""
     rows = []
     for point in opened:
-        row: dict[str, Any] = {**point.parameters, "status": point.status, "branch": ""}
+        branch = "" if found is None else found.branch(point)
+        row: dict[str, Any] = {**point.parameters, "status": point.status, "branch": branch}
         row |= {"f_kHz": np.nan, "n_samples": 0, "dt_s": np.nan, "relative_amplitude": np.nan}
         if (run := point.run) is not None:
             row |= {"n_samples": run.n_samples, "dt_s": run.dt_s}
@@ -152,8 +148,6 @@ def points_table(opened: Sequence[OpenedPoint], found: PointsFound | None = None
             if point.status == Oscillation.OSCILLATING and record.repeats:
                 row["f_kHz"] = 1e-3 * record.cycle.frequency_Hz
                 row["relative_amplitude"] = record.relative_amplitude
-        if found is not None:
-            row["branch"] = found.branch(point)
         rows.append(row)
     table = pd.DataFrame(rows)
     if found is not None and found.maps and found.choice is not None:
@@ -177,16 +171,16 @@ def fits_table(found: PointsFound) -> pd.DataFrame:
     """One row per point and fit: its status, loss and R2 of the derivatives."""
     rows = []
     for k, (label, record) in enumerate(found.fitted.items()):
-        fronts = found.first.points[label].fronts.values()
-        problems = list(dict.fromkeys(front.rows for front in fronts))
         for name, trial in found.last.items():
-            fits = trial.fits
-            how = {"status": "fitted", "loss": np.nan}
+            fits, only = trial.fits, found.by_model.get("")  # of terms that were searched
+            fronts = (only or found.by_model[name.removesuffix(REFINED)]).points[label].fronts
+            problems = list(dict.fromkeys(front.rows for front in fronts.values()))
+            status, loss = ("fitted", np.nan)
             if fits.statuses:
-                how = {"status": fits.statuses[k], "loss": fits.losses[k]}
-            scores = rows_r2(fits.models[k], problems)
-            scores = {f"r2_{state}": value for state, value in scores.items()}
-            rows.append({**record.parameters, "fit": name, **how, **scores})
+                status, loss = fits.statuses[k], fits.losses[k]
+            row = {**record.parameters, "fit": name, "status": status, "loss": loss}
+            r2 = rows_r2(fits.models[k], problems)
+            rows.append(row | {f"r2_{state}": value for state, value in r2.items()})
     return pd.DataFrame(rows)
 
 
@@ -263,24 +257,18 @@ def _by_function(rows: pd.DataFrame) -> pd.DataFrame:
 def _coefficients(found: LawChoice) -> pd.DataFrame:
     """Coefficients at every point, refined alone and from the law, each with 95 % intervals."""
     points = {record.label: record.parameters for record in found.records}
-    kinds = {
-        "alone": dict(zip(points, found.choice.fits.models, strict=True)),
-        "law": {label: read_law(found.law, point) for label, point in points.items()},
-    }
-    alone, law = (
-        coefficients(models).rename(
-            columns={"coef": kind, "lower": f"{kind}_low", "upper": f"{kind}_high"}
-        )
-        for kind, models in kinds.items()
-    )
-    at = pd.DataFrame.from_dict(points, orient="index")
-    both = law.merge(alone, how="left", on=["model", "state", "term"])
-    return at.merge(both, left_index=True, right_on="model").drop(columns="model")
+    of_law = [read_law(found.law, point) for point in points.values()]
+    both = pd.DataFrame.from_dict(points, orient="index").rename_axis("model").reset_index()
+    for kind, models in {"law": of_law, "alone": found.choice.fits.models}.items():
+        names = {"coef": kind, "lower": f"{kind}_low", "upper": f"{kind}_high"}
+        own = coefficients(dict(zip(points, models, strict=True))).rename(columns=names)
+        both = both.merge(own, how="left")
+    return both.drop(columns="model")
 
 
 def _add_left_out(report: Report, found: LawChoice, remedy: str) -> None:
     metrics: list[Metric[LeftOutRun]] = [
-        *map(_parameter, found.records[0].parameters),
+        *map(of_parameter, found.records[0].parameters),
         Metric("enclosed", lambda p: p.inside, View.SHOWN),
         Metric("f_kHz", lambda p: p.record.repeats and 1e-3 * p.record.cycle.frequency_Hz),
         *(metric.of(lambda p: p.run, view=View.SHOWN) for metric in EVALUATION),
@@ -294,10 +282,6 @@ def _add_left_out(report: Report, found: LawChoice, remedy: str) -> None:
             "not trust it at a point without a record; try points that lie closer together, longer "
             f"records, or {remedy} (docs/points.md)"
         )
-
-
-def _parameter(name: str) -> Metric[LeftOutRun]:
-    return Metric(name, lambda p: p.record.parameters[name], View.SHOWN, name, "{:g}")
 
 
 def _add_map(
@@ -329,16 +313,12 @@ def _add_map(
 
 
 def _metrics(found: LawChoice) -> list[Metric[LawTrial]]:
-    def terms(trial: LawTrial) -> str:
-        common = trial.fits.relations.common
-        return terms_text(common.support)
-
     def nine_in_ten(trial: LawTrial) -> float:
         return float(np.quantile(trial.errors, 0.9)) if len(trial.errors) else np.nan
 
     return [
         Metric("fit", lambda trial: trial.name, View.SHOWN),
-        Metric("terms", terms),
+        Metric("terms", lambda trial: terms_text(trial.fits.relations.common.support)),
         Metric("functions", lambda trial: ", ".join(trial.functions.names), View.SHOWN),
         Metric("numbers", lambda trial: trial.n_numbers, View.SHOWN),
         Metric("error", lambda trial: trial.error, View.SHOWN, format="{:.3g}"),
@@ -380,7 +360,8 @@ def add_quantities(
     }
     errors = {name: trial.error for name, trial in found.last.items() if len(trial.errors)}
     estimates = estimates_of(found.last, own, published)
-    laws = control_laws(estimates, list(found.opened[0].parameters))
+    usable = estimates[estimates["usable"].astype(bool) & np.isfinite(estimates["value"])]
+    laws = control_laws(usable, list(found.opened[0].parameters))
     best = min((fit for fit, _ in laws), key=lambda fit: errors.get(fit, np.inf), default="")
     report.summary["best_fit"] = best or None
     missing = f"a law needs {LEAST_POINTS} points, and all parameters to vary over them"
@@ -392,7 +373,7 @@ def add_quantities(
     report.table("control_laws", ResultTable(rows, CONTROL_LAW), note=CONTROL, bold=bold)
     lines = lines_of([record.parameters for record in found.fitted.values()])
     report.section("Quantities", INTERVALS)
-    _add_figures(report, estimates, laws, published, lines, errors, labels)
+    _add_figures(report, usable, laws, published, lines, errors, labels)
     report.table("quantities", estimates, shown=False)
     shown = [
         _equation(name, law, units[fit, name], percent(2)(law.search_error))
@@ -453,25 +434,20 @@ def estimates_of(
     return table.merge(known, how="left", on=[*parameters, "fit", "quantity"])
 
 
-def control_laws(
-    estimates: pd.DataFrame, parameters: list[str]
-) -> dict[tuple[str, str], ControlLaw]:
-    """A control law per fit and quantity, from the points at which the fit finished."""
+def control_laws(usable: pd.DataFrame, parameters: list[str]) -> dict[tuple[str, str], ControlLaw]:
+    """A control law per fit and quantity, where the points suffice. usable: rows of estimates."""
     found = {}
-    for (fit, name), rows in estimates.groupby(["fit", "quantity"], sort=False):
-        used = rows[rows["usable"]]
-        points = used[parameters].to_numpy(float)
-        if len(used) >= LEAST_POINTS and np.ptp(points, axis=0).all():
+    for (fit, name), rows in usable.groupby(["fit", "quantity"], sort=False):
+        points, values = rows[parameters].to_numpy(float), rows["value"].to_numpy()
+        with suppress(ValueError):  # too few points, or a parameter that is the same at all
             functions = control_functions(parameters, points)
-            found[str(fit), str(name)] = fit_control_law(
-                used["value"].to_numpy(), points, functions
-            )
+            found[str(fit), str(name)] = fit_control_law(values, points, functions)
     return found
 
 
 def _add_figures(
     report: Report,
-    estimates: pd.DataFrame,
+    usable: pd.DataFrame,
     laws: Laws,
     published: pd.DataFrame,
     lines: Sequence[tuple[str, Mapping[str, float]]],
@@ -479,7 +455,6 @@ def _add_figures(
     labels: Mapping[str, str],
 ) -> None:
     """Add a figure of each model: its quantities by least squares, refined, and published."""
-    usable = estimates[estimates["usable"].astype(bool)]
     for model in dict.fromkeys(fit.removesuffix(REFINED) for fit in usable["fit"] if lines):
         kinds = {model: "least squares", model + REFINED: "refined"}
         best = min(kinds, key=lambda fit: errors.get(fit, np.inf))

@@ -16,10 +16,9 @@ from ep2sindy.data.numbers import least_squares
 from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.method import Regression
 from ep2sindy.discovery.result import Discovery
-from ep2sindy.discovery.several_points import FOUND, WINDOWS, LawSearch
+from ep2sindy.discovery.several_points import WINDOWS, LawSearch
 from ep2sindy.library.facts import Known
 from ep2sindy.library.library import Library, named_terms, polynomial
-from ep2sindy.library.relations import constraint
 from ep2sindy.library.roles import Roles
 from ep2sindy.operating.law import LawFunctions, constrain_law, make_basis, read_law
 from ep2sindy.operating.left_out import LawChoice, LawTrial, choose_law
@@ -79,14 +78,14 @@ class ModelSettings:
     known: Known = field(default_factory=dict)
     quantities: Mapping[str, Quantity] = field(default_factory=dict)
 
-    def library(self, name: str, states: Sequence[str]) -> Library:
+    def library(self, name: str, states: Sequence[str], parameters: Sequence[str]) -> Library:
         """The library of these terms, with what is known of them."""
         library, terms = terms_of(self.terms, states=states, key=f"models.{name}.terms")
         try:
             known = library.relate(*self.relations).known(self.known).only(terms)
-            held = constraint(library, terms, known.facts.relations)
+            held = constrain_law(known, terms, parameters=parameters)
             for quantity in self.quantities.values():
-                quantity.place(held, library)
+                quantity.place(held.common, library)
         except ValueError as error:
             raise ValueError(
                 f"models.{name} cannot hold: {error} (or leave it out: ~models.{name})"
@@ -173,27 +172,27 @@ class Study:
                 raise ValueError(nothing_moves(statuses))
             libraries = self._libraries or {"": self._library(opened, signal, report)}
             by_model = {
-                name: self._discover(runs, library, workers, report)
+                name: self._discover(runs, name, library, workers, report)
                 for name, library in libraries.items()
             }
             warnings = [text for own in by_model.values() for text in own.data_warnings]
             for text in dict.fromkeys(warnings):
                 report.warn(text)
-            found = self._join(by_model, opened)
+            found = self._join(by_model, opened, report)
             if found.choice is not None:
                 maps = self._map(found.choice, opened, workers, report)
                 found = replace(found, maps=maps)
         self._report(found, report)
 
     def _discover(
-        self, runs: Sequence[Any], library: Library, workers: Workers, report: Report
+        self, runs: Sequence[Any], name: str, library: Library, workers: Workers, report: Report
     ) -> Discovery:
         """What the door finds; where points do not suffice for the law, with constants alone."""
         windows = None
         if self.windows is not None:
             n, periods = self.windows.n_windows, self.windows.periods
             windows = RefinementSettings(n_windows=n, periods=periods)
-        search = LawSearch(self._functions, windows)
+        search = LawSearch(self._functions, windows, name)
         method = None
         if library.facts.roles is not None and self.sustained is not None:
             own = self.sustained
@@ -217,23 +216,23 @@ class Study:
             return replace(found, law=None, data_warnings=(*found.data_warnings, reason))
 
     def _join(
-        self, by_model: Mapping[str, Discovery], opened: Sequence[OpenedPoint]
+        self, by_model: Mapping[str, Discovery], opened: Sequence[OpenedPoint], report: Report
     ) -> PointsFound:
-        """What was found for every model, and the best of all their laws."""
-        first, trials = next(iter(by_model.values())), list[LawTrial]()
-        for name, own in by_model.items():
-            assert own.law_choice is not None
-            trials += [
-                replace(trial, name=trial.name.replace(f"{FOUND}_1", name) if name else trial.name)
-                for trial in own.law_choice.trials
-            ]
-        choice = None if first.law is None else first.law_choice
-        if choice is not None and len(by_model) > 1:
+        """What was found for every model, and the best of all their laws.
+
+        Models whose law holds on one of two cycles alone give way to those of all records.
+        """
+        most = max(len(own.points) for own in by_model.values())
+        if fewer := [name for name, own in by_model.items() if len(own.points) < most]:
+            report.warn(f"left out, for their laws hold on one cycle alone: {', '.join(fewer)}")
+        by_model = {name: own for name, own in by_model.items() if name not in fewer}
+        first = next(iter(by_model.values()))
+        choices = [own.law_choice for own in by_model.values() if own.law_choice is not None]
+        trials = [trial for own in choices for trial in own.trials]
+        choice = None if first.law is None else choices[0]
+        if choice is not None and len(choices) > 1:
             choice = replace(choose_law(trials), cycle=choice.cycle)
-        elif choice is not None:
-            taken = trials[[t is choice.choice for t in choice.trials].index(True)]
-            choice = replace(choice, trials=trials, choice=taken)
-        return PointsFound(trials, choice, first, opened)
+        return PointsFound(trials, choice, by_model, opened)
 
     def _library(
         self, opened: Sequence[OpenedPoint], signal: Embedded | None, report: Report
@@ -345,16 +344,9 @@ class Study:
     @cached_property
     def _libraries(self) -> dict[str, Library]:
         """The libraries of the models that are given."""
-        states = self.source.states
-        found = {name: own.library(name, states) for name, own in (self.models or {}).items()}
-        for name, library in found.items():  # relations and functions must hold at some point
-            try:
-                constrain_law(library, library.facts.only, parameters=self._given.names)
-            except ValueError as error:
-                raise ValueError(
-                    f"models.{name} cannot hold: {error} (or leave it out: ~models.{name})"
-                ) from error
-        return found
+        states, parameters = self.source.states, self._given.names
+        models = (self.models or {}).items()
+        return {name: own.library(name, states, parameters) for name, own in models}
 
 
 def functions_through(
