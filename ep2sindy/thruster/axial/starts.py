@@ -203,8 +203,8 @@ class Restart:
         return Beginning(state, whole=True)
 
 
-# Each has a unique `label`, and makes the first state from the centres z of all cells in m, with the
-# ghosts, and the run's parameters as JSON.
+# Each has a unique `label`, and makes the first state from the centres z of all cells in m, ghosts
+# included, and the run's parameters as JSON.
 Start = GuessedStart | ColdStart | SoftStart | Restart
 
 
