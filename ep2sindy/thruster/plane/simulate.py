@@ -204,8 +204,8 @@ class Rows:
         work = new_work(*state.E.shape)
 
         def march(rows: slice) -> int:
-            out = (*self.planes[:, rows], self.profiles[rows], self.series[rows])
-            return advance(state, model, work, sample_s, averaged, *out)[0]
+            out = tuple(self.planes[:, rows]), self.profiles[rows], self.series[rows]
+            return advance(state, model, work, sample_s, averaged, *out)
 
         return march
 
