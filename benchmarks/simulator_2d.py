@@ -60,13 +60,13 @@ def cycle(n_z: int, n_r: int, *, cold: bool = False, warm_up_s: float = WARM_UP_
     model = build_model(THRUSTER_2D, OPERATING_POINT_2D, grid)
     state = (cold_state if cold else initial_state)(grid, model)
     one, work = Rows.allocate(1, grid), new_work(n_z, n_r)
-    sample = (*one.planes, one.profiles, one.series)
+    sample = tuple(one.planes), one.profiles, one.series
     advance(state, model, work, 1e-9, True, *sample)  # compiled
     n_warm_up, n_rows = round(warm_up_s / SAMPLE_S), round(DURATION_S / SAMPLE_S)
     series = np.empty((n_warm_up + n_rows, one.series.shape[1]))
     began = time.process_time()
     for k in range(len(series)):
-        done, _ = advance(state, model, work, SAMPLE_S, True, *sample)
+        done = advance(state, model, work, SAMPLE_S, True, *sample)
         series[k] = one.series[0]
         if not done:
             raise RuntimeError(f"the run on {n_z} x {n_r} diverged at {1e3 * k * SAMPLE_S:.2f} ms")

@@ -178,10 +178,18 @@ def test_the_rate_comes_from_a_table(tmp_path: Path) -> None:
     assert np.isnan(after["R_ion"].values[:, 2]).all()
 
 
-@pytest.mark.parametrize("text", ["1,1e-22\n", "5,1\n1,2\n", "a,b\nc,d\n"])
-def test_a_bad_table_is_refused(tmp_path: Path, text: str) -> None:
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("1,1e-22\n", "must have two rows or more: it has 1"),
+        ("T,k\n1,1e-22\n", "a rate table must have two columns"),
+        ("5,1\n1,2\n", "a rate table must have two columns"),
+        ("a,b\nc,d\n", "must have 2 numbers in every row"),
+    ],
+)
+def test_a_bad_table_is_refused(tmp_path: Path, text: str, message: str) -> None:
     (tmp_path / "rates.csv").write_text(text)
-    with pytest.raises(ValueError, match="a rate table must have two columns"):
+    with pytest.raises(ValueError, match=message):
         read_rate_table(tmp_path / "rates.csv")
 
 

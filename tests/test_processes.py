@@ -1,6 +1,5 @@
 """Equations by process: common factors, signs and digits, in text, LaTeX and HTML."""
 
-import html
 import re
 from dataclasses import replace
 
@@ -10,8 +9,6 @@ import pytest
 import ep2sindy as ep
 from ep2sindy.library.equations import equation_html, equation_text, terms_latex
 from ep2sindy.library.roles import constraint_of, groups_of
-from ep2sindy.report.document import Equation
-from ep2sindy.report.page import equation_mathml
 
 STATES = ["n_i", "n_n"]
 LIBRARY = ep.polynomial(STATES, degree=3)
@@ -54,9 +51,9 @@ def test_latex_and_pages_say_the_same() -> None:
         r"n_{i} \, n_{n} \, (1.62 \cdot 10^{-32} \, n_{i} + 3.12 \cdot 10^{-33} \, n_{n})"
     )
     assert last == r"- n_{i} \, (3.64 \cdot 10^{5} + 8.45 \cdot 10^{-14} \, n_{i})"
-    shown = html.unescape(re.sub(r"<[^>]*>", "", equation_html("n_n", groups["n_n"])))
-    assert shown == ("dnn/dt = 2.31×1023 − ni nn (1.62×10−32 ni + 3.12×10−33 nn) − 2.76×103 nn")
-    page = equation_mathml(Equation("n_n", groups["n_n"]))
+    page = equation_html("n_n", groups["n_n"])
+    shown = re.sub(r"<[^>]*>|[\s\u2009]", "", page)
+    assert shown == "dnn/dt=2.31·1023−ninn(1.62·10−32ni+3.12·10−33nn)−2.76·103nn"
     assert page.count("<math ") == 3  # what enters, what is exchanged, what leaves
     assert page.count("(") == page.count(")") == 1
 

@@ -1,4 +1,4 @@
-"""Notation of equations: text, LaTeX, HTML, sympy."""
+"""Notation of equations: text, LaTeX, the MathML that HTML shows, sympy."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from html.entities import name2codepoint
 from types import MappingProxyType
 from typing import TYPE_CHECKING, TypeAlias
+from xml.etree import ElementTree
 
 from ep2sindy.library.names import RECIPROCAL, Part, split_term
 from ep2sindy.library.roles import Group
@@ -147,26 +148,23 @@ def _text_term(name: str, size: float, half_width: float | None, digits: int) ->
 
 
 def _latex_term(name: str, size: float, half_width: float | None, digits: int) -> str:
-    mantissa, exponent = _number(size, digits)
-    number = mantissa + ("" if exponent is None else rf" \cdot 10^{{{exponent}}}")
+    error = [rf"(\pm {_latex_number(half_width, 2)})"] if half_width else []
     factors = [] if name == "1" else [latex_term_name(name)]
-    return r" \, ".join([*([] if factors and size == 1.0 else [number]), *factors])
+    number = [] if factors and size == 1.0 and not error else [_latex_number(size, digits)]
+    return r" \, ".join([*number, *error, *factors])
 
 
-def _html_term(name: str, size: float, half_width: float | None, digits: int) -> str:
-    error = f" (&plusmn;{_number_html(half_width, 2)})" if half_width else ""
-    term = _term_html(name)
-    if size == 1.0 and not error and term[:1] not in ("", "/"):
-        return term
-    return f"{_number_html(size, digits)}{error} {term}".strip()
+def _latex_number(value: float, digits: int) -> str:
+    mantissa, _, exponent = f"{value:.{digits}g}".partition("e")
+    return mantissa + (rf" \cdot 10^{{{int(exponent)}}}" if exponent else "")
 
 
-def terms_latex(terms: Sum, *, digits: int = 3) -> list[str]:
+def terms_latex(terms: Sum, *, digits: int = 3, reach: Reach = NOTHING) -> list[str]:
     r"""LaTeX of every term, or group of terms, with its sign: `- 2.62 \cdot 10^{5} \, n_{i}`.
 
-    A factor of one is not written.
+    reach: half-width of the confidence interval by term name. A factor of one is not written.
     """
-    return _parts_in(LATEX, terms, digits)
+    return _parts_in(LATEX, terms, digits, reach)
 
 
 def equations_latex(equations: Mapping[str, Sum], *, digits: int = 3) -> str:
@@ -178,13 +176,29 @@ def equations_latex(equations: Mapping[str, Sum], *, digits: int = 3) -> str:
     return "\\begin{aligned}\n" + " \\\\\n".join(lines) + "\n\\end{aligned}"
 
 
-def equation_html(state: str, terms: Sum, *, reach: Reach = NOTHING) -> str:
-    """HTML of one equation, with sub- and superscripts, to three digits.
+def equation_html(state: str, terms: Sum, *, rate: bool = True, reach: Reach = NOTHING) -> str:
+    """MathML of one equation, to three digits, with an element per term: lines break between them.
 
-    terms: or groups of them. reach: half-width of the confidence interval by term name.
+    terms: or groups of them. rate: of the state's rate. reach: half-width of the confidence
+    interval by term name.
     """
-    right = " ".join(_parts_in(HTML, terms, 3, reach)) or "0"
-    return f"d{_variable_html(state)}/dt = {right}".replace("-", "&minus;")
+    left = latex_name(state)
+    if rate:
+        left = rf"\mathrm{{d}} {left} / \mathrm{{d}} t"
+    first, *others = terms_latex(terms, reach=reach) or ["0"]
+    begin = f"{left} = {{{first}}}"  # in a group of its own a minus is a sign, not an operation
+    return " ".join(map(mathml, (begin, *(f"{t[0]} \\,{t[1:]}" for t in others))))
+
+
+def mathml(latex: str) -> str:
+    """LaTeX as a `math` element; names in it end as text, never as markup."""
+    from latex2mathml.converter import convert_to_element  # only when a page is written
+
+    element = convert_to_element(latex)
+    for each in element.iter():
+        if each.text:
+            each.text = html.unescape(each.text)  # signs come as entities, as in `&#x02212;`
+    return ElementTree.tostring(element, encoding="unicode")
 
 
 def sum_sympy(terms: Mapping[str, float]) -> sympy.Expr:
@@ -225,17 +239,6 @@ def factor_sympy(part: Part) -> sympy.Expr:
     return known.get(part.function, sympy.Function(part.function))(argument)
 
 
-def _number(coef: float, digits: int) -> tuple[str, int | None]:
-    """Absolute mantissa, and the power of ten, or None if the number needs no exponent."""
-    mantissa, _, exponent = f"{abs(coef):.{digits}g}".partition("e")
-    return mantissa, int(exponent) if exponent else None
-
-
-def _number_html(coef: float, digits: int) -> str:
-    mantissa, exponent = _number(coef, digits)
-    return mantissa + ("" if exponent is None else f"&times;10<sup>{exponent}</sup>")
-
-
 def _parts(name: str) -> list[Part]:
     """Factors and powers of a term; a name that cannot be read as a term is kept as it is."""
     try:
@@ -251,36 +254,11 @@ def _sides(name: str) -> tuple[list[Part], list[Part]]:
     return [part for part in parts if part.function != RECIPROCAL], below
 
 
-def _term_html(name: str) -> str:
-    above, below = _sides(name)
-    over = " ".join(map(_part_html, above))
-    return " / ".join([over, *map(_part_html, below)]).strip()
-
-
-def _part_html(part: Part) -> str:
-    argument = part.argument_of(_variable_html(part.variable), times=" ")
-    function = html.escape(part.function.removeprefix(RECIPROCAL))
-    text = f"{function}({argument})" if function or not part.is_bare else argument
-    return text + (f"<sup>{part.power}</sup>" if part.power > 1 else "")
-
-
-def _variable_html(variable: str) -> str:
-    variable, _, zone = variable.partition("@")
-    if variable.startswith("<") and variable.endswith(">"):
-        place = f"<sub>{html.escape(zone)}</sub>" if zone else ""
-        return f"&lang;{_term_html(variable[1:-1])}&rang;{place}"
-    stem, _, index = variable.partition("_")
-    stem = f"&{stem};" if _is_greek(stem) else html.escape(stem)
-    index = ",".join(filter(None, (index, zone)))
-    return f"<i>{stem}</i>" + (f"<sub>{html.escape(index)}</sub>" if index else "")
-
-
 def _is_greek(stem: str) -> bool:
-    """True for small Greek letters that LaTeX, matplotlib and HTML call by the same name."""
+    """True for small Greek letters that LaTeX and matplotlib call by the same name."""
     alpha_to_omega = 0x3B1 <= name2codepoint.get(stem, 0) <= 0x3C9
     return alpha_to_omega and stem not in ("omicron", "sigmaf")
 
 
 TEXT = Notation(_text_term, lambda factor: factor.replace("*", " "), "")
 LATEX = Notation(_latex_term, lambda factor: rf"{latex_term_name(factor)} \,", " ")
-HTML = Notation(_html_term, _term_html, " ")

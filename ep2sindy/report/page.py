@@ -6,7 +6,6 @@ by the browser.
 
 from __future__ import annotations
 
-import html
 import re
 from base64 import b64encode
 from collections.abc import Collection, Mapping, Sequence
@@ -14,9 +13,8 @@ from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from xml.etree import ElementTree
 
-from ep2sindy.library.equations import latex_name, terms_latex
+from ep2sindy.library.equations import equation_html
 from ep2sindy.report.document import Block, Equation, Link, Result, Section, Table, Text, cell_text
 from ep2sindy.runtime.files import read_bytes
 
@@ -63,7 +61,7 @@ def _environment() -> Environment:
         lstrip_blocks=True,
     )
     environment.globals.update(
-        equation=equation_html,
+        equation=shown_html,
         cell=cell_html,
         classes=_classes,
         kind_of=lambda block: type(block).__name__,
@@ -74,14 +72,15 @@ def _environment() -> Environment:
     return environment
 
 
-def equation_html(block: Equation) -> Markup:
+def shown_html(block: Equation) -> Markup:
     """An equation with its lead, unit and mark; its text is escaped here."""
     from markupsafe import Markup, escape
 
     lead = escape(f"{block.lead}: ") if block.lead else ""
     unit = f' <span class="unit">{powers_html(block.unit)}</span>' if block.unit else ""
     mark = escape(block.mark.replace("<-", "←"))
-    return Markup(f'{lead}<span class="math">{equation_mathml(block)}</span>{unit}{mark}')
+    equation = equation_html(block.state, block.terms, rate=block.rate)
+    return Markup(f'{lead}<span class="math">{equation}</span>{unit}{mark}')
 
 
 def cell_html(value: object) -> Markup:
@@ -89,7 +88,7 @@ def cell_html(value: object) -> Markup:
     from markupsafe import Markup
 
     if isinstance(value, Equation):
-        return equation_html(value)
+        return shown_html(value)
     if isinstance(value, Link):
         return Markup('<a href="{}">{}</a>').format(value.to, value.text)
     return powers_html(re.sub(r"(?<![\w.)^])-(?=\d)", "−", cell_text(value)))
@@ -130,30 +129,6 @@ def _lines(blocks: Sequence[Block]) -> int:
 def _classes(table: Table, row: int) -> str:
     kinds = {"bold": table.bold, "italic": table.italic, "break": table.breaks}
     return " ".join(name for name, rows in kinds.items() if row in rows)
-
-
-def equation_mathml(equation: Equation) -> str:
-    """The equation as MathML, without lead, unit and mark.
-
-    Every term is an element of its own: browsers break a line between two, and never within one.
-    """
-    left = latex_name(equation.state)
-    if equation.rate:
-        left = rf"\mathrm{{d}} {left} / \mathrm{{d}} t"
-    first, *others = terms_latex(equation.terms) or ["0"]
-    begin = f"{left} = {{{first}}}"  # in a group of its own a minus is a sign, not an operation
-    return " ".join(map(mathml, (begin, *(f"{t[0]} \\,{t[1:]}" for t in others))))
-
-
-def mathml(latex: str) -> str:
-    """LaTeX as a `math` element; names in it end as text, never as markup."""
-    from latex2mathml.converter import convert_to_element  # only when a page is written
-
-    element = convert_to_element(latex)
-    for each in element.iter():
-        if each.text:
-            each.text = html.unescape(each.text)  # signs come as entities, as in `&#x02212;`
-    return ElementTree.tostring(element, encoding="unicode")
 
 
 @dataclass(frozen=True)

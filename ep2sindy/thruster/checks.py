@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 
@@ -18,10 +18,20 @@ def set_profile(owner: object, places: str, name: str, positive_in: str | None) 
     for field in (places, name):
         object.__setattr__(owner, field, tuple(float(value) for value in getattr(owner, field)))
     check_increasing(owner, places)
-    check_rows(owner, places, name)
-    if positive_in is not None and (least := min(getattr(owner, name))) <= 0.0:
+    values, n_places, who = getattr(owner, name), len(getattr(owner, places)), type(owner).__name__
+    if len(values) != n_places:
+        raise ValueError(
+            f"{who}.{name} must have one number for each of {places}: {len(values)} for {n_places}"
+        )
+    if not np.all(np.isfinite(values)):
+        row = int(np.argmin(np.isfinite(values)))
+        raise ValueError(
+            f"{who}.{name} must be finite, got {values[row]!r} at position {row}; fill the gap or "
+            "leave the row out"
+        )
+    if positive_in is not None and (least := min(values)) <= 0.0:
         got = f"{least:g} {positive_in}".strip()
-        raise ValueError(f"{type(owner).__name__}.{name} must be positive everywhere, got {got}")
+        raise ValueError(f"{who}.{name} must be positive everywhere, got {got}")
 
 
 def check_positive(owner: object, *names: str) -> None:
@@ -57,21 +67,3 @@ def check_increasing(owner: object, name: str) -> None:
             f"{type(owner).__name__}.{name} must increase: {values[row]:g} follows "
             f"{values[row - 1]:g} at position {row}; sort the rows first, and fill the gaps"
         )
-
-
-def check_rows(owner: object, first: str, *names: str) -> None:
-    """Raise ValueError for a named column without one finite number for each entry of `first`."""
-    wanted = len(getattr(owner, first))
-    for name in names:
-        values: Sequence[float] = getattr(owner, name)
-        if len(values) != wanted:
-            raise ValueError(
-                f"{type(owner).__name__}.{name} must have one number for each of {first}: "
-                f"{len(values)} for {wanted}"
-            )
-        if not np.all(np.isfinite(values)):
-            row = int(np.argmin(np.isfinite(values)))
-            raise ValueError(
-                f"{type(owner).__name__}.{name} must be finite, got {values[row]!r} at "
-                f"position {row}; fill the gap or leave the row out"
-            )

@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from ep2sindy.thruster import propellants
 from ep2sindy.thruster.propellant_files import propellant
-from ep2sindy.thruster.tables import number, read_cells
+from ep2sindy.thruster.tables import read_columns
 
 
 def ionization_rate(
@@ -74,14 +74,10 @@ def ionization_rate(
 
 def read_rate_table(path: Path) -> tuple[Float[np.ndarray, " rows"], Float[np.ndarray, " rows"]]:
     """First two columns of a CSV file: T_e in eV, increasing, and rate in m^3/s."""
-    cells = [row[:2] for row in read_cells(path, "rate table", may_be_short=True)]
-    rows = [row for row in cells if any(number(cell) is not None for cell in row)]
-    gaps = [row for row in rows if len(row) < 2 or None in map(number, row)]
-    columns = np.array([] if gaps else rows, dtype=np.float64).reshape(-1, 2)
-    if len(columns) < 2 or np.any(np.diff(columns[:, 0]) <= 0):
-        content = f"a row {gaps[0]}" if gaps else f"{len(columns)} rows of numbers"
+    _, columns = read_columns(path, "rate table")
+    if min(columns.shape) < 2 or np.any(np.diff(columns[0]) <= 0):
         raise ValueError(
-            f"a rate table must have two columns, T_e in eV (increasing) and rate in m^3/s, and "
-            f"two rows or more: {path} has {content}"
+            "a rate table must have two columns, T_e in eV (increasing) and rate in m^3/s, and two "
+            f"rows or more: {path} has {len(columns)} columns, the first {columns[0].tolist()}"
         )
-    return columns[:, 0], columns[:, 1]
+    return columns[0], columns[1]

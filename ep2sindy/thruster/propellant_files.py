@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -10,32 +11,12 @@ from typing import Any
 import numpy as np
 
 from ep2sindy.data.readers.source import file_named
-from ep2sindy.thruster.constants import ATOMIC_MASS, M_ARGON, M_KRYPTON, M_XENON
+from ep2sindy.thruster.constants import ATOMIC_MASS
 from ep2sindy.thruster.propellants import FURTHER_IONIZATIONS, FurtherIonization, PropellantTable
 from ep2sindy.thruster.tables import read_columns
 
 GASES = Path(__file__).parent / "gases"
 RATES = ("ionization", "excitation", "momentum")
-# Energies in eV: HallThruster.jl's tables, whose lumped levels they are; argon: its cross sections
-FIRST: dict[str, dict[str, float]] = {
-    "xenon": {"ionization_eV": 12.1298437, "excitation_eV": 8.32},
-    "krypton": {"ionization_eV": 13.9996055, "excitation_eV": 9.99},
-    "argon": {"ionization_eV": 15.8, "excitation_eV": 11.5},
-}
-HIGHER: dict[str, dict[str, float]] = {
-    "xenon": {
-        "double_ionization": 33.1048437, "second_ionization": 20.975,
-        "triple_ionization": 64.1548427, "ion_double_ionization": 52.025,
-        "third_ionization": 31.05,
-    },
-    "krypton": {
-        "double_ionization": 38.3594455, "second_ionization": 24.35984,
-        "triple_ionization": 74.2174455, "ion_double_ionization": 60.21784,
-        "third_ionization": 35.838,
-    },
-    "argon": {},
-}  # fmt: skip
-MASSES = {"xenon": M_XENON, "krypton": M_KRYPTON, "argon": M_ARGON}
 
 
 def propellant(name: str, *, coulomb_weight: float = 1.0) -> PropellantTable:
@@ -67,15 +48,15 @@ def propellant(name: str, *, coulomb_weight: float = 1.0) -> PropellantTable:
     """
     if name == "xenon_5eV":
         return _resample_ionization(propellant("xenon", coulomb_weight=coulomb_weight), name)
-    if name not in MASSES:
+    with (GASES / "gases.toml").open("rb") as file:
+        gases = tomllib.load(file)
+    if name not in gases:
         raise ValueError(
-            f"there are the propellants {[*sorted(MASSES), 'xenon_5eV']}, got {name!r}; a table "
+            f"there are the propellants {[*sorted(gases), 'xenon_5eV']}, got {name!r}; a table "
             "of your own is read by ep2sindy.thruster.read_propellant"
         )
-    return _table(
-        GASES / f"{name}.csv", name, MASSES[name], FIRST[name], HIGHER[name],
-        coulomb_weight=coulomb_weight,
-    )  # fmt: skip
+    gas = read_propellant(GASES / f"{name}.csv", **gases[name])
+    return replace(gas, coulomb_weight=coulomb_weight)
 
 
 def _resample_ionization(xenon: PropellantTable, name: str) -> PropellantTable:
@@ -136,19 +117,7 @@ def read_propellant(
     ValueError
         If the file or a column is missing, a column is unknown, or there is a gap.
     """
-    first = {"ionization_eV": ionization_eV, "excitation_eV": excitation_eV}
-    path = Path(path)
-    return _table(path, name or path.stem, mass_u * ATOMIC_MASS, first, further_eV or {})
-
-
-def _table(
-    path: Path,
-    name: str,
-    mass: float,
-    first_eV: Mapping[str, float],
-    further_eV: Mapping[str, float],
-    coulomb_weight: float = 1.0,
-) -> PropellantTable:
+    path, further_eV = Path(path), further_eV or {}
     columns = _columns(path)
     scale = {"T_e_eV": 1.0, "mean_energy_eV": 1.5}
     first = [column for column in scale if column in columns]
@@ -158,20 +127,27 @@ def _table(
             f"{path} must have the columns T_e_eV or mean_energy_eV, {', '.join(RATES)}, and may "
             f"have {', '.join(FURTHER_IONIZATIONS.values())}: it has {list(columns)}"
         )
-    rates: dict[str, Any] = {**first_eV} | {f"{key}_rate": columns[key] for key in RATES}
-    rates["T_e_eV"] = tuple(value / scale[first[0]] for value in columns[first[0]])
     if {*further_eV} != {*columns} & {*FURTHER_IONIZATIONS.values()}:
         raise ValueError(
             f"every further ionisation of {path} needs both its column and its energy in "
             f"further_eV: the columns are {list(columns)}, the energies of {list(further_eV)}"
         )
-    rates["further"] = tuple(
+    rates: dict[str, Any] = {f"{key}_rate": columns[key] for key in RATES}
+    further = tuple(
         FurtherIonization(*pair, rate=columns[key], energy_eV=further_eV[key])
         for pair, key in FURTHER_IONIZATIONS.items()
         if key in columns
     )
     with file_named(path):
-        return PropellantTable(name, mass, coulomb_weight=coulomb_weight, **rates)
+        return PropellantTable(
+            name=name or path.stem,
+            mass=mass_u * ATOMIC_MASS,
+            ionization_eV=ionization_eV,
+            excitation_eV=excitation_eV,
+            T_e_eV=tuple(value / scale[first[0]] for value in columns[first[0]]),
+            further=further,
+            **rates,
+        )
 
 
 def _columns(path: Path) -> dict[str, tuple[float, ...]]:

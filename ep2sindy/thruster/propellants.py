@@ -19,12 +19,7 @@ from typing import ClassVar
 import numpy as np
 from jaxtyping import Float
 
-from ep2sindy.thruster.checks import (
-    check_increasing,
-    check_not_negative,
-    check_positive,
-    check_rows,
-)
+from ep2sindy.thruster.checks import check_increasing, check_not_negative, check_positive
 from ep2sindy.thruster.constants import E_CHARGE, M_ELECTRON, M_XENON
 
 E_IONIZATION_EV = 12.13  # eV, first ionisation of xenon (Goebel & Katz, appendix E)
@@ -151,19 +146,8 @@ class FurtherIonization:
     rate: tuple[float, ...]
     energy_eV: float
 
-    def check(self, T_e_eV: tuple[float, ...]) -> None:
-        """Raise ValueError for rates of other rows, negative ones, or no positive energy."""
+    def __post_init__(self) -> None:
         check_positive(self, "energy_eV")
-        name = FURTHER_IONIZATIONS[self.charge, self.higher]
-        if len(self.rate) != len(T_e_eV):
-            raise ValueError(f"{name} must have {len(T_e_eV)} rows, got {len(self.rate)}")
-        check_rate(name, self.rate)
-
-
-def check_rate(name: str, rate: tuple[float, ...]) -> None:
-    """Raise ValueError for a negative coefficient, or one that is not finite."""
-    if not (np.isfinite(rate).all() and min(rate) >= 0.0):
-        raise ValueError(f"{name} must be zero or more in every row")
 
 
 @dataclass(frozen=True)
@@ -194,12 +178,14 @@ class PropellantTable:
         check_positive(self, "mass", "ionization_eV", "excitation_eV")
         check_not_negative(self, "drift_weight", "coulomb_weight")
         check_increasing(self, "T_e_eV")
-        rates = [f"{n}_rate" for n in ("ionization", "excitation", "momentum")]
-        check_rows(self, "T_e_eV", *rates)
-        for name in rates:
-            check_rate(f"PropellantTable.{name}", getattr(self, name))
-        for each in self.further:
-            each.check(self.T_e_eV)
+        rates = {n: getattr(self, f"{n}_rate") for n in ("ionization", "excitation", "momentum")}
+        rates |= {FURTHER_IONIZATIONS[each.charge, each.higher]: each.rate for each in self.further}
+        for name, rate in rates.items():
+            if len(rate) != len(self.T_e_eV) or not all(0.0 <= value < np.inf for value in rate):
+                raise ValueError(
+                    f"the rate of {name} must be zero or more in each of the {len(self.T_e_eV)} "
+                    f"rows of T_e_eV, got {list(rate)}"
+                )
         given = [(each.charge, each.higher) for each in self.further]
         needed = [pair for pair in FURTHER_IONIZATIONS if pair[1] <= self.charge_states]
         if sorted(given) != sorted(needed):

@@ -12,29 +12,22 @@ from jaxtyping import Float
 from ep2sindy.data.readers.source import damage_named
 
 
-def read_cells(path: Path, what: str, *, may_be_short: bool = False) -> list[list[str]]:
-    """Rows of a CSV file, without empty ones and those that begin with #.
+def read_columns(
+    path: Path, what: str, n_columns: int | None = None
+) -> tuple[list[str], Float[np.ndarray, "columns rows"]]:
+    """Names of the columns of a CSV file, none without a header, and their numbers.
 
-    what: name of the file's contents, for errors.
+    Rows that are empty or begin with # are left out. what: name of the contents, for errors.
+    n_columns: None for as many as the first row has. Raises ValueError that names the row of a gap.
     """
     if not path.is_file():
         raise ValueError(f"no such {what}: {path.absolute()}")
     with damage_named(path), path.open(newline="", encoding="utf-8-sig") as file:
-        rows = [[cell.strip() for cell in row] for row in csv.reader(file)]
-    rows = [row for row in rows if any(row) and not row[0].startswith("#")]
-    if len(rows) < 2 and not may_be_short:
-        raise ValueError(f"{path} must have two rows or more: it has {len(rows)}")
-    return rows
-
-
-def read_columns(
-    path: Path, what: str, n_columns: int | None = None
-) -> tuple[list[str], Float[np.ndarray, "columns rows"]]:
-    """Names of the columns, none without a header, and their numbers.
-
-    n_columns: None for as many as the first row has. Raises ValueError that names the row of a gap.
-    """
-    header, *rows = cells = read_cells(path, what)
+        cells = [[cell.strip() for cell in row] for row in csv.reader(file)]
+    cells = [row for row in cells if any(row) and not row[0].startswith("#")]
+    if len(cells) < 2:
+        raise ValueError(f"{path} must have two rows or more: it has {len(cells)}")
+    header, *rows = cells
     if any(number(cell) is not None for cell in header):
         header, rows = [], cells
     n = n_columns or len(cells[0])

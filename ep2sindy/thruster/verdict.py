@@ -95,24 +95,18 @@ def diagnose(field: xr.Dataset, *, diverged: bool, flow_A: float) -> dict[str, A
 def outcome(
     field: xr.Dataset, point: OperatingPoint, *, ion_mass: float, diverged: bool
 ) -> dict[str, Any]:
-    """The results of `diagnose`, and `performance` at mean thrust and power. ion_mass: in kg."""
-    flow_A = 1e-6 * point.mass_flow_mg_s * E_CHARGE / ion_mass
-    found = diagnose(field, diverged=diverged, flow_A=flow_A)
-    if field.sizes["time"]:
-        thrust_N, power_W = field["thrust"].mean(), (field["I_d"] * field["V_d"]).mean()
-        found |= performance(point, thrust_N=float(thrust_N), power_W=float(power_W))
-    return found
+    """The results of `diagnose`, and the performance at mean thrust and power. ion_mass: in kg.
 
-
-def performance(point: OperatingPoint, *, thrust_N: float, power_W: float) -> dict[str, float]:
-    """Mean thrust in N, specific impulse in s and anode efficiency T^2/(2 mdot P).
-
-    power_W: mean of V_d I_d, which with a series resistor is less than the product of their means.
+    Thrust in N, specific impulse in s and anode efficiency T^2/(2 mdot P), with the mean power of
+    V_d I_d, which with a series resistor is less than the product of their means.
     Source: Goebel & Katz, Fundamentals of Electric Propulsion, chapter 2.
     """
     mass_flow = 1e-6 * point.mass_flow_mg_s
-    return {
-        "thrust_N": thrust_N,
-        "isp_s": thrust_N / (mass_flow * STANDARD_GRAVITY),
-        "anode_efficiency": thrust_N**2 / (2.0 * mass_flow * power_W) if power_W else math.nan,
-    }
+    found = diagnose(field, diverged=diverged, flow_A=mass_flow * E_CHARGE / ion_mass)
+    if field.sizes["time"]:
+        thrust_N = float(field["thrust"].mean())
+        power_W = float((field["I_d"] * field["V_d"]).mean())
+        efficiency = thrust_N**2 / (2.0 * mass_flow * power_W) if power_W else math.nan
+        found |= {"thrust_N": thrust_N, "isp_s": thrust_N / (mass_flow * STANDARD_GRAVITY)}
+        found["anode_efficiency"] = efficiency
+    return found

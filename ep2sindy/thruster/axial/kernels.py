@@ -6,7 +6,7 @@ from ep2sindy.runtime.compilation import compiled
 from ep2sindy.thruster.axial import state_kernels as recorded
 from ep2sindy.thruster.axial.electron_kernels import follow_electrons, start_density
 from ep2sindy.thruster.axial.heavy_kernels import add_scaled, follow_heavy, start_speeds
-from ep2sindy.thruster.axial.state_kernels import ENTRY, FAST, LOOP, NO_NAN, SHORTEST_STEP, inside
+from ep2sindy.thruster.axial.state_kernels import ENTRY, FAST, NO_NAN, SHORTEST_STEP, inside
 
 
 @compiled(**NO_NAN)
@@ -28,37 +28,20 @@ def time_step(model, left, w):
     return left / np.ceil(left * top / model.cfl)
 
 
-@compiled(**LOOP)
-def add_fields(sum_n, sum_T, sum_rate, sum_E, sum_energy, n, T, rate, E, energy, weight):
-    for i in range(n.size):
-        sum_n[i] += weight * n[i]
-        sum_T[i] += weight * T[i]
-        sum_rate[i] += weight * rate[i]
-        sum_E[i] += weight * E[i]
-        sum_energy[i] += weight * energy[i]
-
-
-@compiled(**LOOP)
-def add_ions(sum_n, sum_u, sum_g, n, u, g, weight):
-    for i in range(n.size):
-        sum_n[i] += weight * n[i]
-        sum_u[i] += weight * u[i]
-        sum_g[i] += weight * g[i]
-
-
 @compiled(**FAST)
 def add_instant(sums, state, weight, w):
     """Add weight times the present fields to the sums, except those that the heavy step adds."""
     cells = sums.cells
-    add_fields(
-        cells[recorded.N_N], cells[recorded.T_E], cells[recorded.R_ION], cells[recorded.E_Z],
-        cells[recorded.ENERGY], state.n_n, state.T_e_eV, state.rates[0], state.E, state.energy,
-        weight,
-    )  # fmt: skip
+    add_scaled(cells[recorded.N_N], state.n_n, weight)
+    add_scaled(cells[recorded.T_E], state.T_e_eV, weight)
+    add_scaled(cells[recorded.R_ION], state.rates[0], weight)
+    add_scaled(cells[recorded.E_Z], state.E, weight)
+    add_scaled(cells[recorded.ENERGY], state.energy, weight)
     for k in range(state.n_i.shape[0]):
         at = recorded.PER_CHARGE * k
-        n, u, g = recorded.N_I + at, recorded.U_IZ + at, recorded.FLUX_I + at
-        add_ions(cells[n], cells[u], cells[g], state.n_i[k], w.u[k], state.flux_i[k], weight)
+        add_scaled(cells[recorded.N_I + at], state.n_i[k], weight)
+        add_scaled(cells[recorded.U_IZ + at], w.u[k], weight)
+        add_scaled(cells[recorded.FLUX_I + at], state.flux_i[k], weight)
     add_scaled(sums.series, state.instant, weight)
 
 

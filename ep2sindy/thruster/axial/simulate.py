@@ -127,7 +127,9 @@ def simulate(
     """
     run = duration_s, warm_up_s, sample_s, averaged
     settings = Settings(*run, n_cells, stretch, reconstruct, cfl, coldest_T_e_eV)
-    start = as_start(initial)
+    start = GuessedStart() if initial is None else initial
+    if isinstance(start, xr.Dataset | str | Path):
+        start = Restart(start)
     compute = partial(simulate_as, settings, thruster, operating_point, start, progress=progress)
     parameters = {"thruster": thruster, "operating_point": operating_point, "settings": settings}
     parameters["initial"] = start.label
@@ -181,15 +183,6 @@ def simulate_as(
     needed = {"I_d": recorded.CURRENT, "V": recorded.VOLTAGE, "I_supply": recorded.SUPPLY_CURRENT}
     field.attrs |= {f"end_{name}": float(end[place]) for name, place in needed.items()}
     return field
-
-
-def as_start(initial: Start | xr.Dataset | str | Path | None) -> Start:
-    """The start itself; a Dataset or path becomes a `Restart`, None a `GuessedStart`."""
-    if initial is None:
-        return GuessedStart()
-    if isinstance(initial, xr.Dataset | str | Path):
-        return Restart(initial)
-    return initial
 
 
 @dataclass(frozen=True, eq=False)

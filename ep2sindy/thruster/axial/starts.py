@@ -7,7 +7,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, NamedTuple, Protocol, runtime_checkable
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -55,19 +55,6 @@ class Beginning(NamedTuple):
     hold_s: float = 0.0
     resistance: float | None = None
     note: str = ""
-
-
-@runtime_checkable
-class Start(Protocol):
-    """The protocol of starts: a unique name, and the first state.
-
-    z: centres of all cells, including ghosts, in m. parameters: those of the run, as JSON.
-    """
-
-    @property
-    def label(self) -> str: ...
-
-    def begin(self, model: AxialModel, z: Profile, parameters: str) -> Beginning: ...
 
 
 @dataclass(frozen=True)
@@ -214,6 +201,11 @@ class Restart:
         for k, name in enumerate(RATES[: len(state.rates)]):
             state.rates[k] = cells(name)
         return Beginning(state, whole=True)
+
+
+# Each has a unique `label`, and makes the first state from the centres z of all cells in m, ghosts
+# included, and the run's parameters as JSON.
+Start = GuessedStart | ColdStart | SoftStart | Restart
 
 
 def _gas(model: AxialModel) -> Profile:

@@ -5,7 +5,7 @@ import numpy as np
 from ep2sindy.runtime.compilation import compiled
 from ep2sindy.thruster.axial.state_kernels import ENTRY, LOOP, NO_NAN, ONE
 from ep2sindy.thruster.plane.electron_kernels import electron_step
-from ep2sindy.thruster.plane.heavy_kernels import column, heavy_step, velocities
+from ep2sindy.thruster.plane.heavy_kernels import heavy_step, velocities
 
 
 @compiled(**NO_NAN)
@@ -56,49 +56,37 @@ def count_heavy(state, model):
 
 
 @compiled(**LOOP)
-def add_column(sum_n, sum_nn, sum_z, sum_r, here, start, stop, fraction):
+def add_column(total, values, start, stop, fraction):
     for j in range(start, stop):
-        sum_n[j] += fraction * here.n[j]
-        sum_nn[j] += fraction * here.neutrals[j]
-        sum_z[j] += fraction * here.u_z[j]
-        sum_r[j] += fraction * here.u_r[j]
+        total[j] += fraction * values[j]
 
 
 @compiled(**ENTRY)
 def add(state, model, fraction, planes, profiles, numbers):
     """Add a fraction of the state to the sample: fields, profiles along z, current and thrust."""
-    n, nn, u_z, u_r = planes[0], planes[1], planes[2], planes[3]
-    for i in range(state.T_e_eV.size):
-        start, stop = model.lower[i], model.upper[i]
-        add_column(n[i], nn[i], u_z[i], u_r[i], column(state.gas, i), start, stop, fraction)
-        profiles[0, i] += fraction * state.T_e_eV[i]
-        profiles[1, i] += fraction * state.ionization[i]
-        profiles[2, i] += fraction * state.reference_field[i]
+    gas = state.gas
+    for k, field in enumerate((gas.n, gas.neutrals, gas.u_z, gas.u_r)):
+        for i in range(field.shape[0]):
+            add_column(planes[k, i], field[i], model.lower[i], model.upper[i], fraction)
+    for k, along_z in enumerate((state.T_e_eV, state.ionization, state.reference_field)):
+        add_column(profiles[k], along_z, 0, along_z.size, fraction)
     numbers[0] += fraction * state.current[0]
     numbers[1] += fraction * thrust(state, model)
 
 
 @compiled(**ENTRY)
-def store(sample, rows, row, model):
-    """Write the plasma's cells of a sample into a row of the output."""
-    for i in range(sample.shape[0]):
-        for j in range(model.lower[i], model.upper[i]):
-            rows[row, i, j] = sample[i, j]
-
-
-@compiled(**ENTRY)
-def advance(state, model, work, sample_s, averaged, n_i, n_n, u_iz, u_ir, profiles, series):
-    """Fill the rows of the outputs, one every `sample_s`; return (rows filled, steps).
+def advance(state, model, work, sample_s, averaged, fields, profiles, series):
+    """Fill the rows of the outputs, one every `sample_s`; return the number of rows filled.
 
     averaged: if True, rows are means over the steps of a sample, else the state at its end.
-    n_i .. u_ir: (rows, n_z, n_r), written in the plasma only. profiles: (rows, 3, n_z) for T_e,
-    ionization and field. series: (rows, 4) for current, thrust, mass out and mass held.
+    fields: n_i, n_n, u_iz and u_ir, each (rows, n_z, n_r), written in the plasma only. profiles:
+    (rows, 3, n_z) for T_e, ionization and field. series: (rows, 4) for current, thrust, mass out
+    and mass held.
     """
     planes, profile, numbers = work.planes, work.profiles, work.numbers
     velocities(state.gas, model)
-    steps = 0
     if not electron_step(state, model, 0.0, work.columns):
-        return 0, steps
+        return 0
     for row in range(series.shape[0]):
         planes[:], profile[:], numbers[:] = 0.0, 0.0, 0.0
         left = sample_s
@@ -106,21 +94,20 @@ def advance(state, model, work, sample_s, averaged, n_i, n_n, u_iz, u_ir, profil
             dt = left / np.ceil(left * fastest_rate(state, model) / model.cfl)
             heavy_step(state, model, dt, work)
             if not electron_step(state, model, dt, work.columns):
-                return row, steps
+                return row
             left -= dt
-            steps += 1
             if averaged:
                 add(state, model, dt / sample_s, planes, profile, numbers)
         if not averaged:
             add(state, model, 1.0, planes, profile, numbers)
-        store(planes[0], n_i, row, model)
-        store(planes[1], n_n, row, model)
-        store(planes[2], u_iz, row, model)
-        store(planes[3], u_ir, row, model)
+        for k in range(planes.shape[0]):
+            for i in range(planes.shape[1]):
+                for j in range(model.lower[i], model.upper[i]):
+                    fields[k][row, i, j] = planes[k, i, j]
         for k in range(profile.shape[0]):
             for i in range(profile.shape[1]):
                 profiles[row, k, i] = profile[k, i]
         series[row, 0], series[row, 1] = numbers
         series[row, 2] = model.ion_mass * state.left[0]
         series[row, 3] = model.ion_mass * count_heavy(state, model)
-    return series.shape[0], steps
+    return series.shape[0]

@@ -129,23 +129,20 @@ def simulate_2d(
     OSError
         If the cache cannot be written.
     """
-    settings: dict[str, Any] = {
+    settings = {
         "duration_s": duration_s, "warm_up_s": warm_up_s, "sample_s": sample_s,
         "n_z": n_z, "n_r": n_r, "averaged": averaged,
     }  # fmt: skip
-    run = partial(simulate_as, settings, thruster, operating_point, progress=progress)
     parameters = {"thruster": thruster, "operating_point": operating_point, "settings": settings}
+    run = partial(simulate_as, parameters, progress=progress)
     return read_or_run(cache, f"plane_{operating_point.label}", parameters, run, progress)
 
 
-def simulate_as(
-    settings: dict[str, Any],
-    thruster: Thruster,
-    operating_point: OperatingPoint,
-    *,
-    progress: Progress | bool,
-) -> xr.Dataset:
-    """Run `simulate_2d` with its settings as one value."""
+def simulate_as(parameters: dict[str, Any], *, progress: Progress | bool) -> xr.Dataset:
+    """Run `simulate_2d` with the thruster, the operating point and the settings as one value."""
+    thruster: Thruster = parameters["thruster"]
+    operating_point: OperatingPoint = parameters["operating_point"]
+    settings: dict[str, Any] = parameters["settings"]
     sample_s, averaged = settings["sample_s"], settings["averaged"]
     duration_s, warm_up_s = settings["duration_s"], settings["warm_up_s"]
     Settings(duration_s, warm_up_s, sample_s)  # raises ValueError for invalid ones
@@ -164,7 +161,6 @@ def simulate_as(
     field = labelled(rows.until(n_rows), sample_s, grid)
     drop = thruster.series_resistance * field["I_d"].values
     field["V_d"] = ("time", operating_point.voltage - drop, notes(*SERIES["V_d"]))
-    parameters = {"thruster": thruster, "operating_point": operating_point, "settings": settings}
     field.attrs = {
         "title": "2-D (z, r) Hall-thruster fluid model",
         "note": "electrons are quasi-one-dimensional: T_e_eV, R_ion and E_z depend on z alone",
@@ -204,8 +200,8 @@ class Rows:
         work = new_work(*state.E.shape)
 
         def march(rows: slice) -> int:
-            out = (*self.planes[:, rows], self.profiles[rows], self.series[rows])
-            return advance(state, model, work, sample_s, averaged, *out)[0]
+            out = tuple(self.planes[:, rows]), self.profiles[rows], self.series[rows]
+            return advance(state, model, work, sample_s, averaged, *out)
 
         return march
 
