@@ -12,7 +12,7 @@ from ep2sindy.model.comparison import Status
 from ep2sindy.operating import law_fit
 from ep2sindy.operating.law import OperatingLaw, constrain_law, in_hull, read_law
 from ep2sindy.operating.left_out import (
-    HOLDS,
+    MOST,
     WORST,
     LawChoice,
     LawTrial,
@@ -310,7 +310,7 @@ def test_a_law_fitted_to_windows_of_all_records_is_not_bent_by_points_alone(
 class Rated(LawTrial):
     """A trial whose runs are known."""
 
-    held: float = HOLDS
+    share_on_cycle: float = MOST
     score: float = 0.0
 
 
@@ -319,11 +319,11 @@ def test_a_law_is_chosen_that_holds_at_its_own_records_and_then_between_them() -
         functions = ep.polynomial(["a", "b"], degree=degree)
         return Rated(name, fit(), functions, records(), None, np.full(9, error), held, score)
 
-    fails, far = rated("fails", 0.8, 0.1, 1e-3), rated("far", HOLDS, 0.5, 1e-3)
-    near = rated("near", HOLDS, 0.2, 0.1)
+    fails, far = rated("fails", 0.8, 0.1, 1e-3), rated("far", MOST, 0.5, 1e-3)
+    near = rated("near", MOST, 0.2, 0.1)
     assert choose_law([fails, far, near]).choice is near
     # Errors of integration do not tell laws apart; numbers do.
-    more, fewer = rated("more", HOLDS, 0.2, 1e-7, 2), rated("fewer", HOLDS, 0.2, 1e-6)
+    more, fewer = rated("more", MOST, 0.2, 1e-7, 2), rated("fewer", MOST, 0.2, 1e-6)
     assert choose_law([near, more, fewer]).choice is fewer
 
 
@@ -337,7 +337,7 @@ def test_a_run_that_follows_has_no_deviation_and_one_that_fails_the_worst() -> N
     assert fast.status is Status.SUSTAINED
     bound = fast.bounds.frequency
     assert replace(at, run=fast).deviation == pytest.approx(0.005 / bound, rel=1e-2)
-    assert chosen().choice.held == HOLDS
+    assert chosen().choice.share_on_cycle == MOST
 
 
 def test_of_errors_that_cannot_be_told_apart_the_fewest_numbers_are_chosen() -> None:
