@@ -143,6 +143,12 @@ class Roles:
             raise ValueError(f"a role must be given once, got {twice} twice")
         for role in self._roles:
             _check_how(role)
+            supply = role.how.get("1", 0.0) if isinstance(role.how, Mapping) else 0.0
+            if self.nonnegative and not role.giver and supply < 0.0:
+                raise ValueError(
+                    f"of states that cannot be negative an inflow is zero or more, got {supply:g} "
+                    f"for {role.taker!r}; what a state loses is its outflow"
+                )
         if both := [state for state in self.equations if state in self.balanced]:
             raise ValueError(f"a state has roles or a known equation: {both} have both")
 

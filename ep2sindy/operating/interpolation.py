@@ -36,8 +36,9 @@ class Interpolation:
 
     The functions are fitted by least squares to the frequency of the records, and to the standard
     deviation of each state. Half-widths follow from the errors at points left out one at a time,
-    y_p - y_(without p): Student's quantile, with a degree of freedom for every point beyond the
-    number of functions, times their root mean square. Assumes errors of one size at all points.
+    y_p - y_(without p), of those that the others enclose, if there are any: Student's quantile,
+    with a degree of freedom for every point beyond the number of functions, times their root mean
+    square. Assumes errors of one size at all points.
 
     functions: of the parameters. points: of the records, with columns in the order of the
     functions' variables. cycles: for each point, the frequency in Hz, then the standard deviations.
@@ -109,6 +110,9 @@ class Interpolation:
         weights = self.functions.evaluate(values[None])[0] @ basis.to_law(np.ones(1))
         middle = weights @ basis.orthonormal.T @ self.cycles
         quantile = stdtrit(len(self.points) - len(self.functions), 0.975)
-        reach = quantile * np.sqrt(np.square(self._left_out - self.cycles).mean(axis=0))
+        off = self._left_out - self.cycles
+        inside = [in_hull(np.delete(self.points, k, axis=0), p) for k, p in enumerate(self.points)]
+        off = off[inside] if any(inside) else off
+        reach = quantile * np.sqrt(np.square(off).mean(axis=0))
         frequency, *amplitudes = zip(middle.tolist(), reach.tolist(), strict=True)
         return InterpolatedCycle(frequency, dict(zip(self.states, amplitudes, strict=True)))

@@ -379,8 +379,9 @@ def make_basis(
     try:
         if n_spare and len(points) < len(functions) + n_spare:
             raise ValueError(
-                f"a law of {len(functions)} functions of {list(functions.variables)} needs more "
-                f"points than these, since each is left out in turn, got {len(points)}"
+                f"a law of {len(functions)} functions of {list(functions.variables)} needs "
+                f"{len(functions) + n_spare} points or more, since each is left out in turn, got "
+                f"{len(points)}"
             )
         return Basis(functions.evaluate(points))
     except ValueError:

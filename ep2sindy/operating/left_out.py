@@ -285,7 +285,7 @@ def _rests(law: OperatingLaw, point: QuietPoint) -> bool:
     return bool(np.isfinite(path).all() and (path.std(axis=0) < SMALL * point.scale).all())
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class LawChoice:
     """The law of the records on one cycle, and what was tried for it.
 
@@ -300,6 +300,9 @@ class LawChoice:
     runs: Sequence[LeftOutRun]
     interpolation: Interpolation | None = None
     cycle: str = "all"
+
+    def __repr__(self) -> str:
+        return "\n".join([f"{self.choice.name}: {self.heading}", self.text])
 
     @property
     def law(self) -> OperatingLaw:
@@ -366,6 +369,11 @@ class LawChoice:
         if isfinite(found["f_enclosed"]):
             said += f" and errs there by {_percent(found, 'enclosed')} in the median"
         said = f"{said}; {self._windows_text}. "
+        for name, values in zip(
+            self.choice.fits.parameters, self.choice.fits.points.T, strict=True
+        ):
+            if len(set(values)) == 2:
+                said += f"{name} takes two values, and nothing between them was tested. "
         if not isfinite(found["f_interpolated"]):
             return f"{said}No point is enclosed by others whose records repeat cycles."
         between = _percent(found, "interpolated")

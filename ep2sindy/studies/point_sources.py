@@ -16,7 +16,7 @@ from ep2sindy.data.quantities import STEP_DOUBT
 from ep2sindy.data.readers.source import file_named
 from ep2sindy.data.run_files import parameters_in, points_of, points_on_axes
 from ep2sindy.data.trajectory import ConstantStateError, Trajectory, point_label
-from ep2sindy.operating.records import Point, name_point
+from ep2sindy.operating.records import OperatingRecord, Point, name_point
 from ep2sindy.report.report import Report
 from ep2sindy.runtime.parallel import Workers, collect
 from ep2sindy.signals.spectrum import Oscillation, oscillation
@@ -142,7 +142,8 @@ class PointSource:
         with name_point(self.parameters):
             try:
                 field = self.source.field()
-                if (status := field.attrs.get("status")) in USELESS:
+                status = field.attrs.get("status", Oscillation.OSCILLATING)
+                if status in USELESS:
                     return replace(opened, given=status)
                 run = self.run(field, inputs)
                 doubts = [field.attrs[STEP_DOUBT]] if STEP_DOUBT in field.attrs else []
@@ -150,7 +151,7 @@ class PointSource:
                 words = [field.attrs.get("file", ""), self.source.trajectory.place(field)]
                 used = "; ".join(word for word in words if word)
                 zones, _ = zones_in(self.source, field)
-                return replace(opened, run=run, notes=notes, used=used, zones=zones)
+                return OpenedPoint(self.parameters, run, status, notes, used, zones)
             except DivergedError:
                 return replace(opened, given=Oscillation.DIVERGED)
             except ConstantStateError:
@@ -161,7 +162,7 @@ class PointSource:
 class OpenedPoint:
     """One operating point, and the run that was recorded there.
 
-    run: None if the record tells nothing of a law. given: what the source says of such a record.
+    run: None if the record tells nothing of a law. given: what the source says of the record.
     notes: data-quality warnings on problems of the data. used: description of the data. zones: of
     the run, with their recorded balances.
     """
@@ -175,8 +176,13 @@ class OpenedPoint:
 
     @cached_property
     def status(self) -> str:
-        """Whether the record oscillates; else what it, or its source, says."""
-        return self.given if self.run is None else oscillation(self.run.t, self.run.states)
+        """Whether the record oscillates; else what its source says, or the record itself."""
+        if self.run is None or self.given != Oscillation.OSCILLATING:
+            return self.given
+        found = oscillation(self.run.t, self.run.states)
+        # A cycle may be small next to a large mean, such as that of an absolute pressure.
+        is_cycle = found is Oscillation.STEADY and OperatingRecord(self.run).repeats
+        return Oscillation.OSCILLATING if is_cycle else found
 
     @property
     def label(self) -> str:

@@ -17,7 +17,7 @@ from ep2sindy.figures.operating import cycle_figure, laws_figure, rows_at, trend
 from ep2sindy.model.comparison import Status
 from ep2sindy.operating.law import OperatingLaw, read_law
 from ep2sindy.operating.left_out import LawChoice, LawTrial, LeftOutRun
-from ep2sindy.operating.map import MapPoint
+from ep2sindy.operating.map import MapPoint, map_points
 from ep2sindy.operating.point_fits import FAILED
 from ep2sindy.operating.quantities import (
     LEAST_POINTS,
@@ -68,6 +68,7 @@ CAPTIONS = {
 # What a law's model does at a point without a record of its cycle.
 ALONE = {Status.SUSTAINED: "oscillates", Status.DECAYS: "rests", Status.DIVERGES: "diverges"}
 
+N_BETWEEN = 13  # points along each parameter at which cycles are interpolated
 MOST_LAWS = 3  # on the screen
 
 INTERVALS = (
@@ -208,7 +209,8 @@ def add_law(
     rows, alone = _law_rows(law), _coefficients(taken)
     report.table("laws", rows, shown=Table(_by_function(rows), note=LAW_INTERVALS))
     report.samples("law_coefficients", alone)
-    draw = partial(laws_figure, alone, law, parameters=parameters, labels=labels)
+    by_values = sorted(parameters, key=lambda name: alone[name].nunique())  # the most on the axis
+    draw = partial(laws_figure, alone, law, parameters=by_values, labels=labels)
     report.figure("laws", draw, CAPTIONS["laws"])
     shown, head = [], f"Law of {choice.name} over {', '.join(law.parameters)}"
     shown += [Text(text) for text in (taken.text, law.doubt) if text]
@@ -216,6 +218,7 @@ def add_law(
         heading = taken.heading
         head = f"Law of {choice.name}: {heading}" if taken.is_trusted else heading.capitalize()
         _add_left_out(report, taken, remedy)
+        _add_interpolation(report, taken)
         shown.append(Text(_add_map(report, found, points, labels)))
     report.section("Structures and laws compared")
     bold = [k for k, trial in enumerate(found.trials) if trial is choice]
@@ -282,6 +285,23 @@ def _add_left_out(report: Report, found: LawChoice, remedy: str) -> None:
             "not trust it at a point without a record; try points that lie closer together, longer "
             f"records, or {remedy} (docs/points.md)"
         )
+
+
+def _add_interpolation(report: Report, found: LawChoice) -> None:
+    """Frequency and amplitudes between the records without a model, with their half-widths."""
+    if found.interpolation is None:
+        return
+    rows = []
+    for point in map_points([record.parameters for record in found.records], N_BETWEEN):
+        with suppress(ValueError):  # beyond the records
+            names = found.interpolation.functions.variables
+            cycle = found.interpolation.at(**{name: point[name] for name in names})
+            row = {**point, "f_kHz": 1e-3 * cycle.frequency_Hz[0]}
+            row["f_kHz_within"] = 1e-3 * cycle.frequency_Hz[1]
+            for state, (value, within) in cycle.amplitude.items():
+                row |= {f"std_{state}": value, f"std_{state}_within": within}
+            rows.append(row)
+    report.samples("interpolation", pd.DataFrame(rows))
 
 
 def _add_map(

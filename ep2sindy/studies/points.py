@@ -13,6 +13,7 @@ import pandas as pd
 from jaxtyping import Float
 
 from ep2sindy.data.numbers import least_squares
+from ep2sindy.data.trajectory import Trajectory, point_label
 from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.method import Regression
 from ep2sindy.discovery.result import Discovery
@@ -24,6 +25,7 @@ from ep2sindy.operating.law import LawFunctions, constrain_law, make_basis, read
 from ep2sindy.operating.left_out import LawChoice, LawTrial, choose_law
 from ep2sindy.operating.map import MapPoint, law_map, map_points
 from ep2sindy.operating.quantities import Quantity
+from ep2sindy.operating.quiet import quiet_points
 from ep2sindy.operating.records import Point, read_points
 from ep2sindy.refinement.problem import RefinementSettings
 from ep2sindy.regression.rows import Formulation
@@ -111,8 +113,8 @@ class Study:
     pattern of files, which names the parameters. models: by name, with their terms. Without any,
     terms are searched: under the roles of `sustained`; or if that is None, or a single signal was
     recorded, of which a second state is made, among the products of the states up to a degree.
-    degree: None means 2, and 3 of a signal. windows: of the refinements; None takes those of
-    `LawSearch`. law: functions of the parameters that give all coefficients: the degree of
+    degree: None means 3 of up to two states, else 2. windows: of the refinements; None takes those
+    of `LawSearch`. law: functions of the parameters that give all coefficients: the degree of
     polynomials, or names such as ["1", "V_D_V"]; None chooses them. map_points: number of points
     along each parameter, of a map over the law; None: no map. labels: names of parameters and
     quantities in figures. thesis: published quantities by model. keep: whether a run continues with
@@ -243,7 +245,7 @@ class Study:
         states, own = list(self.source.states), self.sustained
         degree = self.degree or (own and own.degree)
         if self._roles is None:
-            return polynomial(states, degree=degree or 2)
+            return polynomial(states, degree=degree or (3 if len(states) < 3 else 2))
         known = self._known(self._roles, opened, report)
         return polynomial(states, degree=degree or 3).with_roles(known)
 
@@ -373,7 +375,8 @@ def functions_through(
 def embed_points(opened: Sequence[OpenedPoint]) -> tuple[list[OpenedPoint], Embedded]:
     """The signal of every point with the states that one embedding makes of it at all points.
 
-    A record that does not oscillate for long enough has no part in it; its status says so.
+    A quiet record has its states from the embedding of the others. One that is not quiet, but does
+    not oscillate for long enough, has no part in it; its status says so.
     """
     traces, made = {}, list(opened)
     for k, point in enumerate(opened):
@@ -386,6 +389,17 @@ def embed_points(opened: Sequence[OpenedPoint]) -> tuple[list[OpenedPoint], Embe
     states = embed_alike(list(traces.values()))
     for k, own in zip(traces, states, strict=True):
         made[k] = replace(opened[k], run=own.run)
+    others: dict[int, Trajectory] = {}
+    for k, point in enumerate(opened):
+        if point.run is not None and k not in traces:
+            with suppress(ValueError):
+                along = states[0].along(point.run)
+                others[k] = replace(along, parameters=point.run.parameters, label=point.run.label)
+    every = [[own.run] for own in states] + [[run] for run in others.values()]
+    quiet = {point_label(each.parameters) for each in quiet_points(every, states[0].names)}
+    for k, run in others.items():
+        if opened[k].label in quiet:
+            made[k] = replace(opened[k], run=run, given=Oscillation.STEADY)
     return made, states[0]
 
 
