@@ -307,3 +307,24 @@ def breathing_at(a: float) -> ep.Trajectory:
     t = 0.1 * np.arange(4000)
     states = model.simulate(t, [0.9 * size, size]).states
     return ep.Trajectory(t, states, ["n_i", "n_n"], units=model.units).window(2000, 4000)
+
+
+def test_a_law_of_one_signal_rests_where_it_is_noise_on_a_large_mean(tmp_path: Path) -> None:
+    """A tube whose sound is small next to the pressure: silent at two powers, loud at four."""
+    rng = np.random.default_rng(0)
+    for a in (-0.4, -0.2, 0.2, 0.4, 0.6, 0.8):
+        x = lienard(a).states[:, 0] if a > 0.0 else np.zeros(lienard(1.0).n_samples)
+        noisy = 60.0 + x + 0.02 * rng.normal(size=len(x))
+        table = pd.DataFrame({"t [s]": lienard(1.0).t, "p [Pa]": noisy})
+        table.to_csv(tmp_path / f"a{a}.csv", index=False)
+    found = programs.computed(
+        composed(
+            "data=recognised", "data.path=null", f"points.files='{tmp_path}/a{{a}}.csv'",
+            "trajectory.states=[p]", "map_points=2", "parallel=serial", f"output={tmp_path}",
+        )
+    )  # fmt: skip
+    points = found.report.tables["points"].set_index("a")
+    assert points["status"].tolist() == ["steady"] * 2 + ["oscillating"] * 4
+    assert points["law"].tolist()[:2] == ["rests"] * 2
+    assert found.report.headline["n_rests"] == found.report.headline["n_quiet"] == 2
+    assert found.report.headline["n_fitted_sustained"] == 4

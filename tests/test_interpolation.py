@@ -44,7 +44,7 @@ def test_an_interpolation_does_not_extrapolate() -> None:
         drawn(0).at(p=3.5)
     with pytest.raises(ValueError, match="an operating point must"):
         drawn(0).at(q=2.0)
-    with pytest.raises(ValueError, match="needs more points than these"):
+    with pytest.raises(ValueError, match="needs 3 points or more"):
         drawn(0, n_points=2)
 
 

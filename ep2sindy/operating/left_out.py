@@ -281,8 +281,10 @@ def _rests(law: OperatingLaw, point: QuietPoint) -> bool:
     start = point.rest + SMALL * point.scale
     reach = np.abs(start) + point.scale
     model = read_law(law, point.parameters)
-    path = simulate(model, t, start, None, blow_up=1e3, reach=reach).states[N_SAMPLES // 2 :]
-    return bool(np.isfinite(path).all() and (path.std(axis=0) < SMALL * point.scale).all())
+    run = simulate(model, t, start, None, blow_up=1e3, reach=reach)
+    if run.diverged or not np.isfinite(run.states).all():
+        return False
+    return bool((run.states[N_SAMPLES // 2 :].std(axis=0) < SMALL * point.scale).all())
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -13,7 +13,7 @@ import pandas as pd
 from jaxtyping import Float
 
 from ep2sindy.data.numbers import least_squares
-from ep2sindy.data.trajectory import Trajectory, point_label
+from ep2sindy.data.trajectory import point_label
 from ep2sindy.discovery.discover import discover
 from ep2sindy.discovery.method import Regression
 from ep2sindy.discovery.result import Discovery
@@ -161,6 +161,7 @@ class Study:
             inputs = self.source.inputs(self._libraries.values())
             sources = self._given.sources
             opened, signal = open_points(sources, inputs, workers=workers, report=report), None
+            opened = mark_quiet(opened)
             if self._is_signal:
                 opened, signal = embed_points(opened)
             runs = [point.run for point in opened if point.run is not None]
@@ -372,6 +373,19 @@ def functions_through(
     return found
 
 
+def mark_quiet(opened: Sequence[OpenedPoint]) -> list[OpenedPoint]:
+    """The points, of which those are steady whose records are quiet next to the others."""
+    runs = [[point.run] for point in opened if point.run is not None]
+    states = runs[0][0].state_names if runs else ()
+    quiet = {point_label(each.parameters) for each in quiet_points(runs, states)} if runs else ()
+    return [
+        replace(point, given=Oscillation.STEADY)
+        if point.label in quiet and point.status == Oscillation.OSCILLATING
+        else point
+        for point in opened
+    ]
+
+
 def embed_points(opened: Sequence[OpenedPoint]) -> tuple[list[OpenedPoint], Embedded]:
     """The signal of every point with the states that one embedding makes of it at all points.
 
@@ -389,17 +403,12 @@ def embed_points(opened: Sequence[OpenedPoint]) -> tuple[list[OpenedPoint], Embe
     states = embed_alike(list(traces.values()))
     for k, own in zip(traces, states, strict=True):
         made[k] = replace(opened[k], run=own.run)
-    others: dict[int, Trajectory] = {}
     for k, point in enumerate(opened):
-        if point.run is not None and k not in traces:
+        if point.run is not None and point.status == Oscillation.STEADY:
             with suppress(ValueError):
-                along = states[0].along(point.run)
-                others[k] = replace(along, parameters=point.run.parameters, label=point.run.label)
-    every = [[own.run] for own in states] + [[run] for run in others.values()]
-    quiet = {point_label(each.parameters) for each in quiet_points(every, states[0].names)}
-    for k, run in others.items():
-        if opened[k].label in quiet:
-            made[k] = replace(opened[k], run=run, given=Oscillation.STEADY)
+                run = states[0].along(point.run)
+                run = replace(run, parameters=point.run.parameters, label=point.run.label)
+                made[k] = replace(point, run=run)
     return made, states[0]
 
 
