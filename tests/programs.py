@@ -18,8 +18,8 @@ from omegaconf import DictConfig
 
 from ep2sindy.app.arguments import mend
 from ep2sindy.app.main import main
-from ep2sindy.app.runner import purpose_of, start_run, study_class
-from ep2sindy.app.schema import keys_of, study_of
+from ep2sindy.app.runner import finish, start_run, study_class
+from ep2sindy.app.schema import study_of
 from ep2sindy.report.report import Report
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -80,9 +80,9 @@ def computed(config: DictConfig) -> Computed:
     """A study. Bands of its forecasts are calibrated by few starts: many take most of the time."""
     forecasts = import_module("ep2sindy.forecasting.forecast")
     with patch.object(forecasts, "N_STARTS", 10), start_run(config) as report:
-        kind = study_class(config.study)
-        study_of(kind, config).run(report)
-        report.finish(purpose=purpose_of(kind), keys=keys_of(kind), formats=())
+        study = study_of(study_class(config.study), config)
+        study.run(report)
+        finish(study, report, ())
         assert report.result is not None
         assert len(report.result.title.split()) <= 12, report.result.title  # the verdict alone
     log, page = ((report.folder.path / name).read_text() for name in ("run.log", "report.html"))

@@ -295,6 +295,9 @@ def test_breathing_over_points_is_this_study(tmp_path: Path) -> None:
     supplied = processes[processes["process"] == "neutrals that enter"]
     np.testing.assert_allclose(supplied["modelled"], 1e18 * supplied["a"])
     found.check_figures("laws", "map", "processes")
+    assert (
+        "Find one structure for all operating points" in (found.folder / "report.html").read_text()
+    )
 
 
 def breathing_at(a: float) -> ep.Trajectory:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from datetime import datetime
 from importlib import import_module
@@ -45,9 +45,14 @@ def run_config(config: DictConfig) -> Path:
         except PartDone as done:
             report.say(str(done))
             return report.folder.path
-        formats = config.get("formats", ["png"])
-        report.finish(purpose=purpose_of(kind), keys=keys_of(kind), formats=formats)
+        finish(study, report, config.get("formats", ["png"]))
     return report.folder.path
+
+
+def finish(study: Experiment, report: Report, formats: Sequence[str]) -> None:
+    """Write what a study reported, with the purpose and the settings of the one that acted."""
+    kind = type(getattr(study, "acting", study))
+    report.finish(purpose=purpose_of(kind), keys=keys_of(kind), formats=formats)
 
 
 def purpose_of(kind: type) -> str:

@@ -183,6 +183,11 @@ class Study:
             sustained=self.sustained, labels=self.labels, map_points=MAP_POINTS,
         )  # fmt: skip
 
+    @property
+    def acting(self) -> object:
+        """The study that runs and is described on the page: that of operating points, if any."""
+        return self._over_points or self
+
     def run(self, report: Report) -> None:
         if self._over_points is not None:
             self._over_points.run(report)
