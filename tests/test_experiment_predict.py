@@ -240,7 +240,7 @@ def known_records(folder: Path, system: str) -> list[str]:
     return [
         "data=recognised", "data.path=null", f"points.files='{folder}/{pattern}.csv'",
         f"trajectory.states=[{','.join(law)}]", "trajectory.zone=null",
-        f"models={{own: {{terms: {{{terms}}}}}}}", f"output={folder}/outputs",
+        f"++models={{own: {{terms: {{{terms}}}}}}}", f"output={folder}/outputs",
         "parallel=serial", "keep=false",
     ]  # fmt: skip
 
@@ -251,8 +251,8 @@ def known_records(folder: Path, system: str) -> list[str]:
 def test_the_law_of_known_records_is_headlined(
     experiment: str, system: str, tmp_path: Path
 ) -> None:
-    own = {"parametric": ["thesis=null"], "predict": ["map_points=2", "sustained=none"]}
-    settings = [*known_records(tmp_path, system), *own[experiment]]
+    own = {"parametric": ["~models", "thesis=null"], "predict": ["map_points=2", "sustained=none"]}
+    settings = [*own[experiment], *known_records(tmp_path, system)]
     found = programs.computed(programs.composed(f"+exp={experiment}", *settings))
     summary = found.summary["law"]
     # Rows have the bias of smoothing: the refined coefficients are right.
