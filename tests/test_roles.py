@@ -236,6 +236,15 @@ def test_roles_that_cannot_be_kept_are_refused(record, options, message):
         ep.discover(record, LIBRARY.with_roles(ROLES), **options)
 
 
+def test_a_rule_of_single_equations_is_refused_at_several_points_too(record):
+    runs = [
+        replace(record, states=scale * record.states, parameters={"scale": scale})
+        for scale in (1.0, 2.0)
+    ]
+    with pytest.raises(ValueError, match="a rule must rank whole systems"):
+        ep.discover(runs, LIBRARY.with_roles(ROLES), ep.Regression(), shared=True)
+
+
 def test_known_or_free_takes_what_there_is():
     either = ep.Roles(inflow={"n_n": "known or free"})
     assert either.with_known({"n_n in": {"1": 2.0}}).inflow == {"n_n": 2.0}

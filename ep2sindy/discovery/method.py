@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import groupby
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Bool
@@ -33,6 +33,9 @@ from ep2sindy.regression.searches import BestSubset, Search
 from ep2sindy.runtime.progress import SILENT, Progress
 from ep2sindy.runtime.values import check_kind, set_counts
 from ep2sindy.selection.criteria import EBIC, Evidence, Selection
+
+if TYPE_CHECKING:
+    from ep2sindy.selection.free_run import FreeRunScore
 
 
 @dataclass(frozen=True)
@@ -320,6 +323,18 @@ class Regression:
         data_warnings = _limits(task.runs)
         return replace(choice, ambiguities=tuple(dict.fromkeys(found)), data_warnings=data_warnings)
 
+    @property
+    def rule_of_systems(self) -> FreeRunScore:
+        """The selection, as a search under roles needs it. Raises ValueError for other rules."""
+        from ep2sindy.selection.free_run import FreeRunScore  # loads torch
+
+        if not isinstance(self.selection, FreeRunScore):
+            raise ValueError(
+                "roles tie all equations together, so a rule must rank whole systems: selection "
+                f"must be FreeRunScore(), got {self.selection!r}"
+            )
+        return self.selection
+
     def _choose_under(
         self, task: DiscoveryProblem, *, rng: np.random.Generator, progress: Progress
     ) -> Discovery:
@@ -327,20 +342,14 @@ class Regression:
 
         The search is made once, on all training rows: bootstraps weigh one equation at a time.
         """
-        # These load torch, only for a search under roles.
-        from ep2sindy.selection.conserving import search_conserving_systems
-        from ep2sindy.selection.free_run import FreeRunScore
+        from ep2sindy.selection.conserving import search_conserving_systems  # loads torch
 
-        if not isinstance(self.selection, FreeRunScore):
-            raise ValueError(
-                "roles tie all equations together, so a rule must rank whole systems: selection "
-                f"must be FreeRunScore(), got {self.selection!r}"
-            )
+        rule = self.rule_of_systems
         library = task.library.with_known_terms(task.states)
         with progress.stage(None, "", "rows of the regression"):
             problems = self.formulation.assemble(task.runs, library, rng=rng)
         (systems,) = search_conserving_systems([(task, problems)], self.search, depth=self.depth)
-        decision = self.selection.assess(systems, task.runs, progress=progress)
+        decision = rule.assess(systems, task.runs, progress=progress)
         provenance = self.provenance | _labels(task)
         return choose_system(systems.fronts, decision, self, task.runs, provenance=provenance)
 

@@ -299,12 +299,7 @@ class _Search:
 
     def _under_roles(self, roles: Roles) -> list[LawConstraint]:
         """Structures that keep the roles at every point, the best by free runs of each first."""
-        regression, rule = self.regression, self.regression.selection
-        if not isinstance(rule, FreeRunScore):
-            raise ValueError(
-                "roles tie all equations together, so a rule must rank whole systems: selection "
-                f"must be FreeRunScore(), got {rule!r}"
-            )
+        regression, rule = self.regression, self.regression.rule_of_systems
         tasks = [replace(self.asked, runs=runs) for runs in self.points.values()]
         tasks = [replace(task, library=task.at_point) for task in tasks]
         asked = list(zip(tasks, self.problems.values(), strict=True))

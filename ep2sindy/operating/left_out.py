@@ -270,7 +270,7 @@ def run_freely(
 def _stays(run: Evaluation) -> bool:
     """Whether a run follows the record, or stays on its cycle for as long as it was recorded.
 
-    Whether that cycle attracts takes longer to find out, and is asked of runs at points left out.
+    Whether that cycle attracts as well is asked by `LawTrial.attracts`.
     """
     return run.comparison.stays or run.status is Status.FOLLOWS
 
